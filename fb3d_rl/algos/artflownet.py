@@ -1,0 +1,129 @@
+"""algo=artflownet: draw flow samples, fit ArtFlowNet, then measure it and let it open things."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
+
+from fb3d_rl.algos import setup
+from fb3d_rl.contract import check
+from fb3d_rl.data.generate import generate_samples
+from fb3d_rl.evaluation.evaluate import evaluate
+from fb3d_rl.evaluation.flow import held_out_samples, predict
+from fb3d_rl.evaluation.rows import TrialRow
+from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
+from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
+from fb3d_rl.training.fit import FitOptions, fit
+from fb3d_rl.training.run_log import RunLog
+
+if TYPE_CHECKING:
+    from fb3d_rl.config import EvaluateConfig, TrainConfig
+
+CHECKPOINT = "checkpoint.pt"
+
+
+def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
+    """Train on the configured objects and evaluate on the held-out ones; everything is written below ``out``.
+
+    Returns:
+        One row for each scheduled trial and policy.
+    """
+    device = setup.choose_device(cfg.device)
+    resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
+    options = fit_options(cfg)
+    samples = setup.sample_options(cfg)
+    train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
+    objects = setup.load(held_out)
+
+    columns = (TextColumn("flow samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as bar:
+        task = bar.add_task("", total=cfg.data.train_samples)
+        rows = generate_samples(
+            out / "samples",
+            [entry.folder for entry in train],
+            cfg.data.train_samples,
+            cfg.seed,
+            samples,
+            setup.workers(cfg.data.workers),
+            lambda done: bar.update(task, completed=done),
+        )
+    check(rows, "sample")
+    buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
+    validation, _ = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
+
+    kwargs = {"part_mask_input": cfg.algo.part_mask_input, "neighbors": cfg.algo.neighbors}
+    net = new_network(cfg.seed, **kwargs)
+
+    def validate() -> dict[str, float]:
+        flow, valid = validation["privileged", "flow"], validation["observation", "valid"]
+        numbers = mean_metrics(flow_metrics(predict(net, validation, device), flow, valid))
+        return {f"val/{key}": value for key, value in numbers.items()}
+
+    def checkpoint(state: dict[str, Any]) -> None:
+        save_checkpoint(out / CHECKPOINT, algo="artflownet", config=asdict(cfg), model_kwargs=kwargs, state=state,
+                        seed=cfg.seed)  # fmt: skip
+
+    with RunLog(out, resume_step=resume["step"] if resume else None) as run_log:
+        fit(net, buffer, options, device=device, evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
+            resume=resume["state"] if resume else None)  # fmt: skip
+
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
+    policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
+    policies["artflownet"] = artflownet_policy(net.to("cpu"), limits, speeds)
+    return evaluate(out, objects, policies, setup.protocol(cfg), setup.facts(cfg), net, torch.device("cpu"))
+
+
+def fit_options(cfg: TrainConfig) -> FitOptions:
+    """How ArtFlowNet is fitted."""
+    algo = cfg.algo
+    return FitOptions(
+        steps=algo.steps,
+        batch_size=algo.batch_size,
+        lr=algo.lr,
+        schedule=algo.schedule,
+        clip_norm=algo.clip_norm,
+        rotate=algo.rotate,
+        seed=cfg.seed,
+        log_every=algo.log_every,
+        evaluate_every=algo.evaluate_every,
+        checkpoint_every=algo.checkpoint_every,
+    )
+
+
+def new_network(seed: int, **kwargs: Any) -> ArtFlowNet:
+    """A network with initial weights that depend on the seed alone; the global generator is left as it was."""
+    with torch.random.fork_rng(devices=[]):
+        torch.random.default_generator.manual_seed(seed)
+        return ArtFlowNet(**kwargs)
+
+
+def load_network(path: str | Path) -> ArtFlowNet:
+    """The network of a checkpoint that :func:`run` wrote.
+
+    Raises:
+        UserError: the file is missing or no such checkpoint.
+    """
+    content = load_checkpoint(path, algo="artflownet")
+    net = ArtFlowNet(**content["model_kwargs"])
+    net.load_state_dict(content["state"]["model"])
+    return net.eval()
+
+
+def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
+    """Evaluate the expert, or a trained ArtFlowNet beside the expert."""
+    net = load_network(cfg.checkpoint) if cfg.policy.name == "artflownet" and cfg.checkpoint else None
+    objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
+    policies: dict[str, Any] = {}
+    if cfg.policy.name == "expert" or cfg.evaluation.expert:
+        policies["expert"] = expert_policy(limits, speeds)
+    if net is not None:
+        policies["artflownet"] = artflownet_policy(net, limits, speeds)
+    return evaluate(out, objects, policies, setup.protocol(cfg), setup.facts(cfg), net)

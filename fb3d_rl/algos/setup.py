@@ -1,0 +1,141 @@
+"""From a validated configuration to objects and options; shared by training and evaluation."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.catalog import Entry, partnet_catalog, procedural_catalog
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.contract import UserError
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
+from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.trials import views_of
+from fb3d_rl.perception.contact import ContactOptions
+from fb3d_rl.policies.flow_policy import FlowPolicyOptions, VelocityLimits
+from fb3d_rl.training.checkpoint import git_revision
+
+if TYPE_CHECKING:
+    from fb3d_rl.config import AssetsConfig, EvaluateConfig, TrainConfig
+
+
+def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
+    """Objects to train on and objects to evaluate on."""
+    if assets.source == "procedural":
+        made = procedural_catalog(out / "objects", assets.categories, assets.train_count, assets.eval_count, seed)
+        return [e for e in made if e.split == "train_train"], [e for e in made if e.split == "train_test"]
+    train = partnet_catalog(assets.root, assets.split, assets.split_file)
+    return train, partnet_catalog(assets.root, assets.eval_split, assets.split_file)
+
+
+def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
+    """Objects to evaluate on."""
+    if assets.source == "procedural":
+        made = procedural_catalog(out / "objects", assets.categories, 0, assets.eval_count, seed)
+        return [e for e in made if e.split == "train_test"]
+    return partnet_catalog(assets.root, assets.split, assets.split_file)
+
+
+def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
+    """Read the objects; each with its split."""
+    return [(load_object(entry.folder), entry.split) for entry in entries]
+
+
+def sample_options(cfg: TrainConfig | EvaluateConfig) -> SampleOptions:
+    """How clouds are taken."""
+    camera, data = cfg.camera, cfg.data
+    return SampleOptions(
+        points=data.points,
+        views=views_of(camera.azimuth, camera.elevation),
+        camera=CameraOptions(camera.resolution, camera.fov, camera.margin),
+        closed_share=data.closed_share,
+        others_closed=data.others_closed,
+        all_parts_share=data.all_parts_share,
+    )
+
+
+def env_options(cfg: TrainConfig | EvaluateConfig) -> EnvOptions:
+    """The task's constants."""
+    env = cfg.env
+    return EnvOptions(
+        gripper=_override(GripperOptions(), env.gripper, "env.gripper"),
+        suction=_override(SuctionOptions(), env.suction, "env.suction"),
+        points=cfg.data.points,
+        horizon=env.horizon,
+        success=env.success,
+        sim_freq=env.sim_freq,
+        control_freq=env.control_freq,
+        gravity=env.gravity,
+        joint_friction=env.joint_friction,
+        joint_damping=env.joint_damping,
+        density=env.density,
+        camera=CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin),
+    )
+
+
+def flow_policy_options(cfg: TrainConfig | EvaluateConfig) -> FlowPolicyOptions:
+    """Speeds and distances of the flow policy."""
+    contact = _override(ContactOptions(), cfg.policy.contact, "policy.contact")
+    return _override(FlowPolicyOptions(contact=contact), cfg.policy.flow, "policy.flow")
+
+
+def velocity_limits(cfg: TrainConfig | EvaluateConfig) -> VelocityLimits:
+    """What action 1 means for the gripper."""
+    gripper = env_options(cfg).gripper
+    return VelocityLimits(gripper.v_max, gripper.w_max)
+
+
+def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
+    """What is evaluated."""
+    return Protocol(
+        samples=sample_options(cfg),
+        env=env_options(cfg),
+        trials=cfg.evaluation.trials,
+        samples_per_object=cfg.data.eval_samples,
+        clouds=cfg.evaluation.clouds,
+        seed=cfg.seed,
+    )
+
+
+def choose_device(name: str) -> torch.device:
+    """The device for "auto", "cpu" or "cuda".
+
+    Raises:
+        UserError: CUDA was asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device=cuda, but torch finds no CUDA device; use device=auto or device=cpu")
+    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def workers(count: int | None) -> int:
+    """Worker processes: as configured, or one per core."""
+    return (os.cpu_count() or 1) if count is None else count
+
+
+def facts(cfg: TrainConfig | EvaluateConfig) -> dict[str, Any]:
+    """What summary.json says about a run besides its numbers."""
+    return {
+        "command": " ".join(["python", *sys.argv]),
+        "seed": cfg.seed,
+        "git_revision": git_revision(),
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}, "
+        f"torch {torch.__version__}",
+        "assets": asdict(cfg.assets),
+    }
+
+
+def _override(options: Any, values: dict[str, Any], key: str) -> Any:
+    unknown = set(values) - set(asdict(options))
+    if unknown:
+        raise UserError(f"{key}.{sorted(unknown)[0]} is no such key; choose from {', '.join(asdict(options))}")
+    return replace(options, **values)

@@ -1,0 +1,1 @@
+"""Articulated objects: PartNet-Mobility and UMPNet folders, procedural objects, splits."""

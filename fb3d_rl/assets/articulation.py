@@ -1,0 +1,106 @@
+"""What an articulated object is: links with meshes, joined in a tree.
+
+The frames of PartNet-Mobility's URDF files are kept. Every link has one joint to its parent, the root's being
+``None``; links are stored parents first, so one pass over the arrays walks the tree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh in its link's frame. Shapes: vertices [V, 3] m, faces [F, 3] int."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """The joint that carries a link.
+
+    Attributes:
+        name: the URDF's name.
+        type: "revolute", "continuous", "prismatic" or "fixed".
+        origin: T_parent_joint [4, 4] at joint position 0.
+        axis: unit axis [3] in the joint's frame (zero for a fixed joint).
+        limits: (lower, upper) rad or m; infinite for a continuous joint, (0, 0) for a fixed one.
+    """
+
+    name: str
+    type: JointType
+    origin: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    limits: tuple[float, float]
+
+    @property
+    def movable(self) -> bool:
+        return self.type != "fixed"
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """A rigid part: its name, semantic name ("door", "drawer", ...), parent's index (-1: root), joint and meshes."""
+
+    name: str
+    semantic: str
+    parent: int
+    joint: Joint | None
+    visuals: tuple[Mesh, ...]
+    collisions: tuple[Mesh, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ArticulatedObject:
+    """An object: its id, category, folder's URDF file and links (parents first).
+
+    ``dropped`` names what was left out while reading (degenerate meshes and the like), for reports.
+    """
+
+    id: str
+    category: str
+    urdf: Path
+    links: tuple[Link, ...]
+    dropped: tuple[str, ...] = ()
+
+    @cached_property
+    def movable(self) -> tuple[int, ...]:
+        """Indices of the links with a movable joint; position k of a joint state [J] belongs to ``movable[k]``."""
+        return tuple(i for i, link in enumerate(self.links) if link.joint is not None and link.joint.movable)
+
+    @cached_property
+    def limits(self) -> NDArray[np.float64]:
+        """Joint limits [J, 2] in the order of :attr:`movable`."""
+        return np.array([self.joint_of(i).limits for i in self.movable], dtype=np.float64).reshape(-1, 2)
+
+    def joint_of(self, link: int) -> Joint:
+        """The joint of a link that is not the root."""
+        joint = self.links[link].joint
+        if joint is None:
+            raise ValueError(f"link {self.links[link].name} of {self.id} is the root and has no joint")
+        return joint
+
+    def index(self, name: str) -> int:
+        """Index of the link called ``name``."""
+        for i, link in enumerate(self.links):
+            if link.name == name:
+                return i
+        raise KeyError(f"{self.id} has no link {name!r}")
+
+    def descendants(self, link: int) -> tuple[int, ...]:
+        """The link itself and all links that it carries."""
+        carried = {link}
+        for i, other in enumerate(self.links):
+            if other.parent in carried:
+                carried.add(i)
+        return tuple(sorted(carried))

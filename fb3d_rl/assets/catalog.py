@@ -1,0 +1,80 @@
+"""From an assets setting to object folders: procedural objects made on the fly, or a PartNet-Mobility root."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fb3d_rl.assets import procedural
+from fb3d_rl.assets.partnet_mobility import find_ids, load_objects
+from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
+from fb3d_rl.contract import UserError
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An object of a catalog: its folder, category and split."""
+
+    folder: Path
+    category: str
+    split: str
+
+    @property
+    def id(self) -> str:
+        return self.folder.name
+
+
+def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_out: int, seed: int) -> list[Entry]:
+    """Make ``count`` training and ``held_out`` test objects of each category below ``out``.
+
+    Raises:
+        UserError: a category has no procedural family.
+    """
+    unknown = [name for name in categories if name not in procedural.FAMILIES]
+    if unknown or not categories:
+        raise UserError(
+            f"assets.categories: {', '.join(unknown) or 'the list is empty'}; choose from {', '.join(procedural.FAMILIES)}"
+        )
+    entries = []
+    # Held-out objects come from another seed, so no training object can be among them.
+    for split, number, part_seed in (("train_train", count, 2 * seed), ("train_test", held_out, 2 * seed + 1)):
+        ids = procedural.generate(out / split, categories, number, part_seed)
+        entries += [Entry(out / split / name, _category(out / split / name), split) for name in ids]
+    return entries
+
+
+def partnet_catalog(root: str | None, split: str, split_file: str | None = None) -> list[Entry]:
+    """The objects below a PartNet-Mobility root that ``split`` selects; broken ones are left out and named.
+
+    Args:
+        root: folder that holds ``<id>/mobility.urdf``.
+        split: see :func:`fb3d_rl.assets.splits.select_ids`.
+        split_file: a file in UMPNet's format; UMPNet's own lists unless given.
+
+    Raises:
+        UserError: no such root, no object in it, an unknown split, or no usable object left.
+    """
+    if not root:
+        raise UserError("assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR")
+    ids = find_ids(root)
+    table = read_split(split_file or UMPNET_SPLIT)
+    categories = {name: _category(Path(root) / name) for name in ids}
+    chosen = select_ids(categories, split, table)
+    objects, skipped = load_objects(root, chosen)
+    for item in skipped:
+        log.warning("skipped: %s", item.reason)
+    return [
+        Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table)) for obj in objects
+    ]
+
+
+def _category(folder: Path) -> str:
+    try:
+        return str(json.loads((folder / "meta.json").read_text(encoding="utf-8"))["model_cat"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "unknown"  # load_object says what is wrong with a broken file

@@ -1,0 +1,281 @@
+"""Read PartNet-Mobility folders: ``mobility.urdf``, ``semantics.txt``, ``meta.json`` and ``textured_objs/*.obj``.
+
+The objects come from strangers, so nothing in them is trusted: XML entities are refused, mesh paths may not leave
+the folder, and every flaw ends in one clear sentence (:class:`fb3d_rl.contract.UserError`).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+from xml.etree.ElementTree import ParseError
+
+import numpy as np
+import trimesh
+from defusedxml import DefusedXmlException, ElementTree
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Link, Mesh
+from fb3d_rl.contract import UserError
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
+
+URDF = "mobility.urdf"
+JOINT_TYPES: tuple[JointType, ...] = ("revolute", "continuous", "prismatic", "fixed")
+
+
+def load_object(folder: str | Path) -> ArticulatedObject:
+    """Read one object's folder.
+
+    Meshes are given in their link's frame (the URDF's visual and collision origins applied). Meshes without area
+    are left out and named in ``dropped``.
+
+    Raises:
+        UserError: the folder, the URDF or a mesh is missing or broken; the message names it.
+    """
+    folder = Path(folder)
+    urdf = folder / URDF
+    if not urdf.is_file():
+        raise UserError(f"object {folder.name}: {urdf} does not exist, so the folder is no PartNet-Mobility object")
+    try:
+        robot = ElementTree.parse(urdf).getroot()
+        return _Reader(folder).read(robot)
+    except (ParseError, DefusedXmlException) as error:
+        raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
+    except OSError as error:
+        raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
+
+
+class _Reader:
+    """Reads the parts of one URDF; holds the folder and its mesh cache (visuals and collisions share files)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.meshes: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        self.dropped: list[str] = []
+
+    def read(self, robot: Element) -> ArticulatedObject:
+        elements = {self.attribute(e, "name"): e for e in robot.findall("link")}
+        joints: dict[str, tuple[str, Joint]] = {}
+        for element in robot.findall("joint"):
+            parent, child, joint = self.joint(element)
+            if parent not in elements or child not in elements:
+                self.fail(f"joint {joint.name} joins {parent!r} and {child!r}, of which one is no link")
+            if child in joints:
+                self.fail(f"link {child!r} is the child of two joints")
+            joints[child] = (parent, joint)
+        semantics = self.semantics()
+        links: list[Link] = []
+        for name in self.parents_first(elements, joints):
+            parent, joint = joints.get(name, (None, None))
+            links.append(
+                Link(
+                    name=name,
+                    semantic=semantics.get(name, ""),
+                    parent=-1 if parent is None else [link.name for link in links].index(parent),
+                    joint=joint,
+                    visuals=self.shapes(elements[name], "visual"),
+                    collisions=self.shapes(elements[name], "collision"),
+                )
+            )
+        return ArticulatedObject(
+            id=self.folder.name,
+            category=self.category(),
+            urdf=self.folder / URDF,
+            links=tuple(links),
+            dropped=tuple(dict.fromkeys(self.dropped)),
+        )
+
+    def fail(self, what: str) -> None:
+        raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.folder / URDF}")
+
+    def attribute(self, element: Element, name: str) -> str:
+        value = element.get(name)
+        if value is None:
+            self.fail(f"a <{element.tag}> has no attribute {name!r}")
+        assert value is not None
+        return value
+
+    def numbers(self, text: str | None, count: int, default: float) -> NDArray[np.float64]:
+        """Parse ``count`` finite numbers from an attribute; a missing attribute is ``default`` repeated."""
+        if text is None:
+            return np.full(count, default)
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.array([math.nan])
+        if values.shape != (count,) or not np.isfinite(values).all():
+            self.fail(f"{text!r} is not a list of {count} finite numbers")
+        return values
+
+    def origin(self, element: Element) -> NDArray[np.float64]:
+        """T_parent_child [4, 4] of an ``<origin xyz rpy>``; URDF's rpy turns about the fixed x, y, z axes."""
+        transform = np.eye(4)
+        origin = element.find("origin")
+        if origin is not None:
+            transform[:3, 3] = self.numbers(origin.get("xyz"), 3, 0.0)
+            transform[:3, :3] = Rotation.from_euler("xyz", self.numbers(origin.get("rpy"), 3, 0.0)).as_matrix()
+        return transform
+
+    def joint(self, element: Element) -> tuple[str, str, Joint]:
+        name, kind = self.attribute(element, "name"), self.attribute(element, "type")
+        if kind not in JOINT_TYPES:
+            self.fail(f"joint {name} has the type {kind!r}, not one of {', '.join(JOINT_TYPES)}")
+        ends = [element.find(end) for end in ("parent", "child")]
+        if ends[0] is None or ends[1] is None:
+            self.fail(f"joint {name} lacks its parent or child")
+        parent, child = (self.attribute(end, "link") for end in ends if end is not None)
+        axis, limits = np.zeros(3), (0.0, 0.0)
+        if kind != "fixed":
+            axis_element = element.find("axis")
+            axis = self.numbers(None if axis_element is None else axis_element.get("xyz"), 3, 0.0)
+            if axis_element is None:
+                axis[0] = 1.0  # URDF's default
+            length = float(np.linalg.norm(axis))
+            if length < 1e-9:
+                self.fail(f"joint {name} has an axis of length 0")
+            axis = axis / length
+            limits = (-math.inf, math.inf) if kind == "continuous" else self.limits(element, name)
+        joint_type: JointType = kind  # type: ignore[assignment]
+        return parent, child, Joint(name, joint_type, self.origin(element), axis, limits)
+
+    def limits(self, element: Element, name: str) -> tuple[float, float]:
+        """Limits of a revolute or prismatic joint; missing or infinite ones stay infinite: nothing to open."""
+        limit = element.find("limit")
+        if limit is None:
+            self.dropped.append(f"limits of joint {name}: missing")
+            return (-math.inf, math.inf)
+        try:
+            lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+        except ValueError:
+            lower, upper = math.nan, math.nan
+        if math.isnan(lower) or math.isnan(upper):
+            self.fail(f"joint {name} has limits that are no numbers")
+        if lower > upper:
+            self.dropped.append(f"limits of joint {name}: lower above upper, swapped")
+            lower, upper = upper, lower
+        return (lower, upper)
+
+    def parents_first(self, links: Iterable[str], joints: dict[str, tuple[str, Joint]]) -> list[str]:
+        """Order the links so that each comes after its parent; refuse loops and several roots."""
+        names = list(links)
+        roots = [name for name in names if name not in joints]
+        if len(roots) != 1:
+            self.fail(f"the joint tree has {len(roots)} roots where one is needed")
+        children: dict[str, list[str]] = {name: [] for name in names}
+        for child, (parent, _) in joints.items():
+            children[parent].append(child)
+        order = list(roots)
+        for name in order:
+            order.extend(children[name])
+        if len(order) != len(names):
+            self.fail("the joint tree has a loop")
+        return order
+
+    def shapes(self, link: Element, tag: str) -> tuple[Mesh, ...]:
+        meshes = []
+        for element in link.findall(tag):
+            mesh = element.find("geometry/mesh")
+            if mesh is None:
+                self.dropped.append(f"a {tag} of {link.get('name')}: no mesh")
+                continue
+            filename = self.attribute(mesh, "filename")
+            vertices, faces = self.mesh(filename)
+            scale = self.numbers(mesh.get("scale"), 3, 1.0)
+            transform = self.origin(element)
+            if len(faces) == 0:
+                continue
+            moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
+            meshes.append(Mesh(moved, faces))
+        return tuple(meshes)
+
+    def mesh(self, filename: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        path = (self.folder / filename).resolve()
+        if path in self.meshes:
+            return self.meshes[path]
+        if not path.is_relative_to(self.folder.resolve()):
+            self.fail(f"the mesh path {filename!r} leaves the object's folder")
+        if not path.is_file():
+            self.fail(f"the mesh {filename} is missing")
+        try:
+            loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
+        except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:
+            raise UserError(f"object {self.folder.name}: the mesh {filename} is broken ({error})") from error
+        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
+        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all()):
+            self.fail(f"the mesh {filename} has vertices that are missing or no numbers")
+        corners = vertices[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum()
+        if not area > 0:
+            self.dropped.append(f"{filename}: no surface")
+            faces = faces[:0]
+        self.meshes[path] = (vertices, faces)
+        return self.meshes[path]
+
+    def semantics(self) -> dict[str, str]:
+        """Link name -> semantic name, of lines such as ``link_0 hinge door``; a missing file names nothing."""
+        path = self.folder / "semantics.txt"
+        if not path.is_file():
+            self.dropped.append("semantics.txt: missing")
+            return {}
+        lines = (line.split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines())
+        return {words[0]: words[2] for words in lines if len(words) >= 3}
+
+    def category(self) -> str:
+        path = self.folder / "meta.json"
+        if not path.is_file():
+            return "unknown"
+        try:
+            meta = json.loads(path.read_text(encoding="utf-8"))
+        except (ValueError, UnicodeDecodeError) as error:
+            raise UserError(f"object {self.folder.name}: {path} is no valid JSON ({error})") from error
+        return str(meta.get("model_cat", "unknown")) if isinstance(meta, dict) else "unknown"
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """An object that could not be read, and the sentence that says why."""
+
+    id: str
+    reason: str
+
+
+def load_objects(root: str | Path, ids: Iterable[str]) -> tuple[list[ArticulatedObject], list[Skipped]]:
+    """Read the objects ``ids`` below ``root``; broken ones are skipped and named.
+
+    Raises:
+        UserError: not one object is left.
+    """
+    objects: list[ArticulatedObject] = []
+    skipped: list[Skipped] = []
+    for name in ids:
+        try:
+            objects.append(load_object(Path(root) / name))
+        except UserError as error:
+            skipped.append(Skipped(name, str(error)))
+    if not objects:
+        first = f"; the first: {skipped[0].reason}" if skipped else ""
+        raise UserError(f"no object of {root} can be used ({len(skipped)} are broken{first})")
+    return objects, skipped
+
+
+def find_ids(root: str | Path) -> list[str]:
+    """Ids of the object folders directly below ``root``, sorted.
+
+    Raises:
+        UserError: ``root`` does not exist or holds no object.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise UserError(f"assets.root: {root} is no folder; give the folder that holds <id>/{URDF}")
+    ids = sorted(path.parent.name for path in root.glob(f"*/{URDF}"))
+    if not ids:
+        raise UserError(f"assets.root: {root} holds no object; expected <id>/{URDF} below it")
+    return ids

@@ -1,0 +1,98 @@
+"""Procedural articulated objects, written as PartNet-Mobility folders.
+
+They carry no third party's licence, so they are what the project trains on by default and what its tests use.
+A family is a function from a random generator to an `ObjectSpec`; to add one, write the function and enter it
+in `FAMILIES`.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fb3d_rl.assets.procedural import cabinets, frames, lidded
+from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
+from fb3d_rl.contract import UserError
+
+__all__ = ["FAMILIES", "ObjectSpec", "Part", "generate", "object_id", "sample"]
+
+FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
+    "StorageFurniture": cabinets.storage_furniture,
+    "Table": cabinets.table,
+    "Refrigerator": cabinets.refrigerator,
+    "Microwave": cabinets.microwave,
+    "Safe": cabinets.safe,
+    "Oven": cabinets.oven,
+    "Dishwasher": cabinets.dishwasher,
+    "WashingMachine": frames.washing_machine,
+    "Door": frames.door,
+    "Window": frames.window,
+    "KitchenPot": lidded.kitchen_pot,
+    "TrashCan": lidded.trash_can,
+    "Box": lidded.storage_box,
+    "Bucket": lidded.bucket,
+    "Laptop": lidded.laptop,
+}
+
+
+def object_id(category: str, seed: int, index: int) -> str:
+    """The id, and folder name, of one procedural object."""
+    return f"proc-{category}-{seed}-{index:04d}"
+
+
+def sample(category: str, seed: int, index: int) -> ObjectSpec:
+    """One object of a family, from a generator of its own: it depends on nothing but the three arguments.
+
+    Raises:
+        UserError: If the category has no family or the seed is negative.
+    """
+    if category not in FAMILIES:
+        raise UserError(
+            f"No procedural family for category {category!r}: choose among {', '.join(FAMILIES)}."
+        )
+    if seed < 0:
+        raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
+    rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
+    return FAMILIES[category](rng).normalised()
+
+
+def generate(out: Path, categories: Sequence[str], count: int, seed: int) -> list[str]:
+    """Write `count` objects of each category as out/<id>/ in PartNet-Mobility's layout.
+
+    The same arguments give the same bytes. An object's folder appears complete or not at all; one that is
+    already there is replaced.
+
+    Args:
+        out: Folder of object folders; made if it is not there.
+        categories: Keys of `FAMILIES`.
+        count: Objects per category.
+        seed: Seed of the whole set, at least 0.
+
+    Returns:
+        The ids, by category, then index.
+
+    Raises:
+        UserError: If a category has no family, the count is below 1 or the seed is negative.
+    """
+    if count < 1:
+        raise UserError(f"{count} procedural objects per category were asked for: ask for at least 1.")
+    out.mkdir(parents=True, exist_ok=True)
+    ids = []
+    for category in categories:
+        for index in range(count):
+            name = object_id(category, seed, index)
+            spec = sample(category, seed, index)
+            with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as partial:
+                folder = Path(partial) / name
+                folder.mkdir()
+                write_object(spec, folder, name)
+                if (out / name).exists():
+                    shutil.rmtree(out / name)
+                folder.rename(out / name)
+            ids.append(name)
+    return ids

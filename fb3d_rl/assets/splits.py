@@ -1,0 +1,92 @@
+"""Which objects train and which test.
+
+UMPNet's lists (Xu, He, Song, RA-L 2022) are the reference: ``train_train`` (training instances of eleven categories),
+``train_test`` (held-out instances of the same categories) and ``test`` (ten unseen categories).
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from fb3d_rl.contract import UserError
+
+SPLITS = ("train_train", "train_test", "test")
+UMPNET_SPLIT = Path(__file__).with_name("umpnet_split.json")
+"""UMPNet's own file: {"train": {category: {"train": ids, "test": ids}}, "test": {category: {"test": ids}}}."""
+
+TRAIN_CATEGORIES = (
+    "FoldingChair", "Kettle", "Laptop", "Microwave", "Refrigerator", "Stapler", "StorageFurniture", "Switch",
+    "Toilet", "TrashCan", "Window",
+)  # fmt: skip
+
+HELD_OUT_SHARE = 0.2
+
+
+def read_split(path: str | Path = UMPNET_SPLIT) -> dict[str, str]:
+    """Read a split file in UMPNet's format: object id -> split name.
+
+    Raises:
+        UserError: the file is missing or has another format.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+        return {
+            str(name): "test" if half == "test" else f"train_{part}"
+            for half in ("train", "test")
+            for parts in content[half].values()
+            for part, names in parts.items()
+            for name in names
+        }
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise UserError(f"the split file {path} is missing or not in UMPNet's format ({error!r})") from error
+
+
+def split_of(name: str, category: str, table: Mapping[str, str]) -> str:
+    """Split of an object: by the table, else by its category and a stable hash of its id.
+
+    Objects of unseen categories are test objects; of the train categories one in five is held out.
+    """
+    if name in table:
+        return table[name]
+    if category not in TRAIN_CATEGORIES:
+        return "test"
+    return "train_test" if zlib.crc32(name.encode()) % 1000 < 1000 * HELD_OUT_SHARE else "train_train"
+
+
+def select_ids(categories: Mapping[str, str], split: str, table: Mapping[str, str]) -> list[str]:
+    """Ids that ``split`` names, sorted.
+
+    Args:
+        categories: object id -> category of all objects there are.
+        split: "all", a split's name, or a comma list of split names, categories and object ids.
+        table: object id -> split, from :func:`read_split`.
+
+    Raises:
+        UserError: a word names nothing, or nothing is selected.
+    """
+    known_categories = set(categories.values())
+    chosen: set[str] = set()
+    for word in _words(split):
+        name = word.replace("-", "_")
+        if word == "all":
+            chosen.update(categories)
+        elif name in SPLITS:
+            chosen.update(i for i, category in categories.items() if split_of(i, category, table) == name)
+        elif word in categories:
+            chosen.add(word)
+        elif word in known_categories:
+            chosen.update(i for i, category in categories.items() if category == word)
+        else:
+            raise UserError(
+                f"assets.split: {word!r} is no split ({', '.join(SPLITS)}, all), category or object id of this root"
+            )
+    if not chosen:
+        raise UserError(f"assets.split: no object of this root belongs to {split!r}")
+    return sorted(chosen)
+
+
+def _words(split: str) -> Iterable[str]:
+    return [word.strip() for word in split.split(",") if word.strip()]

@@ -1,0 +1,1 @@
+"""Depth cameras that return world points with link ids, and viewpoint sampling."""

@@ -1,0 +1,207 @@
+"""Typed schemas of the configuration in conf/, and the checks that come before any work. Only launch/ imports this.
+
+The values stand in conf/*.yaml, the meaning of each key in the docstring of the option class that it feeds.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from fb3d_rl.contract import UserError
+
+
+@dataclass
+class AssetsConfig:
+    """Which objects.
+
+    Attributes:
+        source: "procedural" (made on the fly) or "partnet_mobility" (read below ``root``).
+        root: folder with ``<id>/mobility.urdf``.
+        split: what to train on (train.py) or evaluate on (evaluate.py).
+        eval_split: what train.py evaluates on.
+        split_file: split file in UMPNet's format; UMPNet's own lists if null.
+        categories: families of procedural objects.
+        train_count: procedural training objects of each category.
+        eval_count: procedural held-out objects of each category.
+    """
+
+    source: str
+    root: str | None
+    split: str
+    eval_split: str
+    split_file: str | None
+    categories: list[str]
+    train_count: int
+    eval_count: int
+
+
+@dataclass
+class DataConfig:
+    """Flow samples: fb3d_rl.data.samples.SampleOptions, their numbers and the worker processes that draw them.
+
+    Attributes:
+        train_samples: samples to train on.
+        eval_samples: samples per held-out object on which the flow is measured.
+        workers: worker processes; null for one per core.
+    """
+
+    points: int
+    train_samples: int
+    eval_samples: int
+    workers: int | None
+    closed_share: float
+    others_closed: float
+    all_parts_share: float
+
+
+@dataclass
+class CameraConfig:
+    """fb3d_rl.camera.raycast.CameraOptions and fb3d_rl.camera.views.ViewRange."""
+
+    resolution: int
+    fov: float
+    margin: float
+    azimuth: list[float]
+    elevation: list[float]
+
+
+@dataclass
+class AlgoConfig:
+    """fb3d_rl.training.fit.FitOptions and the network's arguments."""
+
+    name: str
+    steps: int
+    batch_size: int
+    lr: float
+    schedule: str
+    clip_norm: float | None
+    rotate: bool
+    log_every: int
+    evaluate_every: int | None
+    checkpoint_every: int | None
+    neighbors: int
+    part_mask_input: bool
+
+
+@dataclass
+class EnvConfig:
+    """fb3d_rl.env.options.EnvOptions."""
+
+    horizon: int
+    success: float
+    sim_freq: int
+    control_freq: int
+    gravity: bool
+    joint_friction: float
+    joint_damping: float
+    density: float
+    gripper: dict[str, float]
+    suction: dict[str, Any]
+
+
+@dataclass
+class PolicyConfig:
+    """fb3d_rl.policies.flow_policy.FlowPolicyOptions; ``name`` chooses where the flow comes from."""
+
+    name: str
+    flow: dict[str, float]
+    contact: dict[str, float]
+
+
+@dataclass
+class EvaluationConfig:
+    """Which trials.
+
+    Attributes:
+        trials: at most this many, spread over the categories; null for all visible openable parts.
+        expert: also run the expert on the same trials.
+        clouds: clouds shown in the report.
+    """
+
+    trials: int | None
+    expert: bool
+    clouds: int
+
+
+@dataclass
+class TrainConfig:
+    """Everything that launch/train.py needs."""
+
+    algo: AlgoConfig
+    assets: AssetsConfig
+    data: DataConfig
+    camera: CameraConfig
+    env: EnvConfig
+    policy: PolicyConfig
+    evaluation: EvaluationConfig
+    seed: int
+    device: str
+    resume: bool
+
+
+@dataclass
+class EvaluateConfig:
+    """Everything that launch/evaluate.py needs; ``checkpoint`` is a file that launch/train.py wrote."""
+
+    assets: AssetsConfig
+    data: DataConfig
+    camera: CameraConfig
+    env: EnvConfig
+    policy: PolicyConfig
+    evaluation: EvaluationConfig
+    checkpoint: str | None
+    seed: int
+    device: str
+
+
+def validate(cfg: TrainConfig | EvaluateConfig) -> None:
+    """Check values that types cannot; the one place for it.
+
+    Raises:
+        UserError: names the first key that is wrong and what it may be.
+    """
+    _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
+    _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+    _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
+    if isinstance(cfg, TrainConfig):
+        _one_of("algo.name", cfg.algo.name, ("artflownet",))
+        _one_of("policy.name", cfg.policy.name, ("artflownet",))
+        _one_of("algo.schedule", cfg.algo.schedule, ("constant", "one_cycle"))
+        for key in ("steps", "batch_size", "lr", "log_every", "neighbors"):
+            _at_least(f"algo.{key}", getattr(cfg.algo, key), 1 if key != "lr" else 1e-12)
+        _at_least("data.train_samples", cfg.data.train_samples, 1)
+        _at_least("assets.train_count", cfg.assets.train_count, 1)
+    elif cfg.policy.name == "artflownet" and not cfg.checkpoint:
+        raise UserError("policy=artflownet needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
+    _at_least("seed", cfg.seed, 0)
+    _at_least("data.points", cfg.data.points, 16)
+    _at_least("data.eval_samples", cfg.data.eval_samples, 1)
+    _at_least("data.workers", 0 if cfg.data.workers is None else cfg.data.workers, 0)
+    _at_least("assets.eval_count", cfg.assets.eval_count, 1)
+    _at_least("camera.resolution", cfg.camera.resolution, 8)
+    _at_least("env.horizon", cfg.env.horizon, 1)
+    _at_least("evaluation.trials", 1 if cfg.evaluation.trials is None else cfg.evaluation.trials, 1)
+    for key in ("closed_share", "others_closed", "all_parts_share"):
+        if not 0 <= getattr(cfg.data, key) <= 1:
+            raise UserError(f"data.{key}={getattr(cfg.data, key)} is no share; give a number from 0 to 1")
+    for key in ("azimuth", "elevation"):
+        ends = getattr(cfg.camera, key)
+        if len(ends) != 2 or ends[0] > ends[1]:
+            raise UserError(f"camera.{key}={ends} is no range; give two ascending angles in degrees, [lowest,highest]")
+    if cfg.assets.source == "partnet_mobility":
+        if not cfg.assets.root:
+            raise UserError("assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR")
+        if not os.path.isdir(cfg.assets.root):
+            raise UserError(f"assets.root={cfg.assets.root} is no folder; give the one that holds <id>/mobility.urdf")
+
+
+def _one_of(key: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise UserError(f"{key}={value} is unknown; choose from {', '.join(choices)}")
+
+
+def _at_least(key: str, value: float, least: float) -> None:
+    if value < least:
+        raise UserError(f"{key}={value} is too small; give {least} or more")

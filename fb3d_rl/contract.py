@@ -1,0 +1,109 @@
+"""The data contract: every TensorDict key with its trailing shape, dtype, unit and frame.
+
+World frame: right-handed, z up, metres, radians. ``T_ab`` maps coordinates in b to coordinates in a (column
+vectors). Quaternions are wxyz, unit, w >= 0. Leading dims: env ``[E]``, rollout ``[E, T]``, rows ``[R]``.
+N is the number of points of a cloud (1200 unless configured otherwise).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+
+ACTION_DIM = 8
+"""x y z, roll pitch yaw, two fingers (supplement, II.C)."""
+
+
+class UserError(Exception):
+    """An error that the user caused and can mend; its message is one clear sentence.
+
+    Commands print the message alone and end with exit code 2.
+    """
+
+
+Key = str | tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One key of the contract: trailing shape ("N" stands for the number of points), dtype and meaning."""
+
+    shape: tuple[int | str, ...]
+    dtype: torch.dtype
+    meaning: str
+
+
+F32, BOOL, I64 = torch.float32, torch.bool, torch.int64
+
+GROUPS: dict[str, dict[Key, Entry]] = {
+    "observation": {
+        ("observation", "points"): Entry(("N", 3), F32, "world points, m"),
+        ("observation", "valid"): Entry(("N",), BOOL, "False on padding"),
+        ("observation", "part_mask"): Entry(("N",), BOOL, "on the part to open"),
+        ("observation", "qpos"): Entry((8,), F32, "x y z (m), roll pitch yaw (rad), two fingers (m)"),
+        ("observation", "qvel"): Entry((8,), F32, "the same per second"),
+        ("observation", "tool_pose"): Entry((7,), F32, "suction tip in the world: p (m) + q (wxyz)"),
+        ("observation", "attached"): Entry((1,), BOOL, "suction holds a movable part"),
+        ("observation", "contact_force"): Entry((1,), F32, "norm of the contact force on the gripper, N"),
+        ("observation", "camera_position"): Entry((3,), F32, "where the depth camera stands in the world, m"),
+    },
+    "action": {
+        "action": Entry((8,), F32, "velocities in [-1, 1]: x y z * v_max, r p y * w_max, fingers * f_max"),
+    },
+    "privileged": {
+        ("privileged", "flow"): Entry(
+            ("N", 3), F32, "ground-truth 3D articulation flow, largest norm 1, 0 on static and padding"
+        ),
+    },
+    "prediction": {
+        ("prediction", "flow"): Entry(("N", 3), F32, "ArtFlowNet's flow"),
+    },
+    "metrics": {
+        "normalized_distance": Entry((1,), F32, "|q_goal - q| / |q_goal - q_start|"),
+        "contact": Entry((1,), BOOL, "suction has held the target part in this episode"),
+    },
+    "sample": {},
+}
+GROUPS["sample"] = {
+    key: GROUPS[key[0]][key]
+    for key in (
+        ("observation", "points"),
+        ("observation", "valid"),
+        ("observation", "part_mask"),
+        ("privileged", "flow"),
+    )
+}
+
+
+def spec(group: str) -> dict[Key, Entry]:
+    """Return the keys of one group ("observation", "action", "privileged", "prediction", "metrics", "sample")."""
+    return GROUPS[group]
+
+
+def check(td: TensorDictBase, group: str) -> None:
+    """Check that ``td`` holds every key of ``group`` with the contract's trailing shape and dtype.
+
+    Raises:
+        ValueError: names the first key that is missing, of another shape or of another dtype.
+    """
+    lead = td.batch_dims
+    points: int | None = None
+    for key, entry in spec(group).items():
+        if key not in td.keys(include_nested=True):
+            raise ValueError(f"{group}: key {key} is missing")
+        value = td.get(key)
+        trailing = tuple(value.shape[lead:])
+        if len(trailing) != len(entry.shape):
+            raise ValueError(f"{group}: {key} has trailing shape {trailing}, the contract says {entry.shape}")
+        for size, expected in zip(trailing, entry.shape, strict=True):
+            if expected == "N":
+                points = size if points is None else points
+                expected = points
+            if size != expected:
+                raise ValueError(
+                    f"{group}: {key} has trailing shape {trailing}, the contract says {entry.shape}"
+                )
+        if value.dtype != entry.dtype:
+            raise ValueError(f"{group}: {key} is {value.dtype}, the contract says {entry.dtype}")

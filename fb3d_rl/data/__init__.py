@@ -1,0 +1,1 @@
+"""Flow samples: drawn from objects without a simulator, kept in TensorDict memory maps."""

@@ -1,0 +1,144 @@
+"""Generate flow samples in worker processes, without a simulator, into a TensorDict memory map."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.contract import UserError
+from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+
+DONE = "samples.json"
+
+
+def generate_samples(
+    out: Path,
+    folders: Sequence[Path],
+    count: int,
+    seed: int,
+    options: SampleOptions,
+    workers: int,
+    progress: Callable[[int], None] = lambda done: None,
+) -> TensorDictBase:
+    """Fill a memory map with ``count`` samples of the objects in ``folders``.
+
+    Sample i depends on (seed, i) alone, whatever the number of workers. Objects take turns, so that each is seen
+    equally often up to one. A finished data set in ``out`` that was made from the same arguments is reused.
+
+    Args:
+        out: folder of the memory map; written anew unless it holds the same data set.
+        folders: PartNet-Mobility object folders.
+        count: number of samples S.
+        seed: base seed.
+        options: how samples are drawn.
+        workers: number of worker processes; 0 draws in this process.
+        progress: called with the number of samples drawn so far.
+
+    Returns:
+        TensorDict [S] of the contract's group "sample" plus "object" [S] int64, an index into ``folders``, and "target" [S]
+        int64, the index of the link to open (-1: all movable parts).
+
+    Raises:
+        UserError: an object never shows an openable part, so no sample can be drawn of any.
+    """
+    recipe = {
+        "objects": [folder.name for folder in folders],
+        "count": count,
+        "seed": seed,
+        "options": asdict(options),
+        "version": 1,
+    }
+    recipe = json.loads(json.dumps(recipe))
+    done_file = out / DONE
+    if done_file.is_file() and json.loads(done_file.read_text())["recipe"] == recipe:
+        return TensorDict.load_memmap(out / "rows")
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    _empty_rows(count, options.points).memmap_like(out / "rows")
+    owner = np.random.default_rng([seed, 0]).permutation(count) % len(folders)
+    jobs = [(out / "rows", folder, f, np.flatnonzero(owner == f), seed, options) for f, folder in enumerate(folders)]
+    missing: list[int] = []
+    drawn = 0
+    if workers == 0:
+        for job in jobs:
+            missing += _draw_object(*job)
+            drawn += len(job[3])
+            progress(drawn)
+    else:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet) as pool:
+            futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
+            for future in as_completed(futures):
+                missing += future.result()
+                drawn += futures[future]
+                progress(drawn)
+    rows = TensorDict.load_memmap(out / "rows")
+    _refill(rows, sorted(missing), count)
+    temporary = done_file.with_suffix(".tmp")
+    temporary.write_text(json.dumps({"recipe": recipe, "refilled": len(missing)}))
+    os.replace(temporary, done_file)
+    return rows
+
+
+def _quiet() -> None:
+    torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
+
+
+def _empty_rows(count: int, points: int) -> TensorDict:
+    n = points
+    row = TensorDict(
+        {
+            "observation": {
+                "points": torch.zeros(n, 3),
+                "valid": torch.zeros(n, dtype=torch.bool),
+                "part_mask": torch.zeros(n, dtype=torch.bool),
+            },
+            "privileged": {"flow": torch.zeros(n, 3)},
+            "target": torch.zeros((), dtype=torch.int64),
+            "object": torch.zeros((), dtype=torch.int64),
+        },
+        batch_size=[],
+    )
+    return row.expand(count)
+
+
+def _draw_object(
+    rows_dir: Path, folder: Path, index: int, rows: np.ndarray, seed: int, options: SampleOptions
+) -> list[int]:
+    """Draw the samples ``rows`` of one object into the memory map; return those that could not be drawn."""
+    if not len(rows):
+        return []
+    view = ObjectView(load_object(folder), options.camera)
+    if not view.openable:
+        return [int(row) for row in rows]
+    table = TensorDict.load_memmap(rows_dir)
+    missing = []
+    for row in rows.tolist():
+        sample = draw_sample(view, options, np.random.default_rng([seed, 1, row]))
+        if sample is None:
+            missing.append(row)
+            continue
+        sample["object"] = torch.tensor(index)
+        table[row] = sample
+    return missing
+
+
+def _refill(rows: TensorDictBase, missing: list[int], count: int) -> None:
+    """Give rows whose object showed nothing a copy of other rows, evenly spread, so that all rows are samples."""
+    if not missing:
+        return
+    present = np.setdiff1d(np.arange(count), missing)
+    if not len(present):
+        raise UserError("no sample could be drawn: none of the objects shows a part that can be opened")
+    for k, row in enumerate(missing):
+        rows[row] = rows[int(present[k * len(present) // len(missing)])].clone()

@@ -1,0 +1,121 @@
+"""One flow sample: a random object, joint state and viewpoint, seen by the depth camera, with its true flow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
+from fb3d_rl.camera.views import View, ViewRange
+from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
+from fb3d_rl.flow.kinematics import KinematicTree
+from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
+from fb3d_rl.perception.cloud import sample_cloud
+
+MIN_VISIBLE = 20
+"""A part with fewer points in the cloud counts as not visible."""
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """How samples are drawn.
+
+    Attributes:
+        points: N, points of a cloud.
+        views: ranges of the viewpoint.
+        camera: the camera's optics.
+        closed_share: share of samples whose target part is exactly closed; the others are uniform over its range.
+        others_closed: probability that each other joint is closed rather than uniform over its range.
+        all_parts_share: share of samples whose target is all movable parts (the reference's target), mask included.
+    """
+
+    points: int = 1200
+    views: ViewRange = ViewRange()
+    camera: CameraOptions = CameraOptions()
+    closed_share: float = 0.3
+    others_closed: float = 0.7
+    all_parts_share: float = 0.3
+
+
+class ObjectView:
+    """An object ready to be looked at: kinematic tree, camera, opening ranges; poses are in the world."""
+
+    def __init__(self, obj: ArticulatedObject, camera: CameraOptions) -> None:
+        self.obj = obj
+        self.tree = KinematicTree.from_object(obj)
+        self.camera = RaycastCamera(obj, options=camera)
+        self.closed, self.open = opening_range(obj)
+        self.base = torch.as_tensor(standing_pose(obj))
+        self.openable = openable_links(obj)
+
+    def direction(self, link: int | None) -> NDArray[np.float64]:
+        """Opening signs [J]: of the joint of ``link`` alone, or of all joints (None; endless ones turn forwards)."""
+        signs = np.where(self.open < self.closed, -1.0, 1.0)
+        if link is not None:
+            signs[[other != link for other in self.obj.movable]] = 0.0
+        return signs
+
+    def cloud(
+        self, qpos: NDArray[np.float64], view: View, points: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """The cloud [N, 3] and link of each point [N] at joint state ``qpos`` [J]."""
+        poses = (self.base @ self.tree.forward(torch.as_tensor(qpos))).numpy()
+        return sample_cloud(*self.camera.capture(poses, view), points, rng)
+
+    def flow(
+        self,
+        points: NDArray[np.float32],
+        links: NDArray[np.int64],
+        qpos: NDArray[np.float64],
+        direction: NDArray[np.float64],
+    ) -> torch.Tensor:
+        """Normalised ground-truth flow [N, 3] float32 of a cloud."""
+        raw = articulation_flow(
+            self.tree,
+            torch.as_tensor(points),
+            torch.as_tensor(links),
+            torch.as_tensor(qpos),
+            torch.as_tensor(direction),
+            self.base,
+        )
+        return normalize_flow(raw)
+
+    def sample(self, links: NDArray[np.int64], points: NDArray[np.float32], qpos: NDArray[np.float64],
+               link: int | None) -> TensorDict:  # fmt: skip
+        """The sample (contract group "sample") of a cloud whose target is ``link`` or all movable parts (None: -1)."""
+        direction = self.direction(link)
+        moving = (direction != 0).astype(np.float64) @ self.tree.descendants.numpy().astype(np.float64) > 0
+        valid = torch.as_tensor(links >= 0)
+        return TensorDict(
+            {
+                "observation": {
+                    "points": torch.as_tensor(points),
+                    "valid": valid,
+                    "part_mask": torch.as_tensor(moving[links]) & valid,
+                },
+                "privileged": {"flow": self.flow(points, links, qpos, direction)},
+                "target": torch.tensor(-1 if link is None else link),
+            },
+            batch_size=[],
+        )
+
+
+def draw_sample(view: ObjectView, options: SampleOptions, rng: np.random.Generator, tries: int = 8) -> TensorDict | None:
+    """Draw one sample of an object, or None if no openable part shows itself within ``tries`` views."""
+    for _ in range(tries):
+        link = int(rng.choice(view.openable))
+        qpos = np.where(rng.random(len(view.closed)) < options.others_closed, 0.0, rng.random(len(view.closed)))
+        target = view.obj.movable.index(link)
+        qpos[target] = 0.0 if rng.random() < options.closed_share else rng.random()
+        qpos = view.closed + qpos * (view.open - view.closed)
+        points, links = view.cloud(qpos, options.views.sample(rng), options.points, rng)
+        part = [link] if rng.random() >= options.all_parts_share else None
+        carried = view.obj.descendants(link)
+        if np.isin(links, carried).sum() >= MIN_VISIBLE:
+            return view.sample(links, points, qpos, None if part is None else link)
+    return None

@@ -1,0 +1,63 @@
+"""The floating suction gripper: an agent with eight velocity-controlled joints (supplement, II.C)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers import PDJointVelControllerConfig
+from mani_skill.agents.registration import register_agent
+from torch import Tensor
+
+from fb3d_rl.env.options import GripperOptions
+
+JOINTS = ("x", "y", "z", "roll", "pitch", "yaw", "finger_left", "finger_right")
+"""Joints in the order of actions, qpos and qvel."""
+
+FINGERS = ("finger_left", "finger_right")
+"""Links whose ends form the suction tip."""
+
+BODIES = ("hand", *FINGERS)
+"""Links that have a shape."""
+
+TOOL = "tool"
+"""Link at the suction tip, 0.12 m from the hand's origin along the tool axis, the hand's +x."""
+
+
+@register_agent()
+class FloatingSuctionGripper(BaseAgent):
+    """A hand on three slides (x, y, z) and three hinges (roll, pitch, yaw), with two closed fingers.
+
+    The hand's origin is at the slides' positions and its rotation is ``Rx(roll) Ry(pitch) Rz(yaw)``
+    (:func:`fb3d_rl.geometry.transforms.euler_xyz_to_matrix`). No gravity acts on it, and its own links do not
+    collide with each other.
+    """
+
+    uid = "floating_suction_gripper"
+    urdf_path = str(Path(__file__).with_name("gripper.urdf"))
+    disable_self_collisions = True
+
+    def __init__(self, *args: Any, options: GripperOptions | None = None, **kwargs: Any) -> None:
+        self.options = options or GripperOptions()
+        super().__init__(*args, **kwargs)
+
+    @property
+    def _controller_configs(self) -> dict[str, PDJointVelControllerConfig]:
+        o = self.options
+        top = [o.v_max] * 3 + [o.w_max] * 3 + [o.f_max] * 2
+        return {
+            "velocity": PDJointVelControllerConfig(
+                joint_names=list(JOINTS),
+                lower=[-speed for speed in top],
+                upper=top,
+                damping=[o.damping] * 3 + [o.angular_damping] * 3 + [o.damping] * 2,
+                force_limit=[o.force_limit] * 3 + [o.torque_limit] * 3 + [o.finger_force_limit] * 2,
+            )
+        }
+
+    def tool_pose(self) -> Tensor:
+        """Pose [E, 7] of the suction tip in the world: p (m) and q (wxyz, w >= 0)."""
+        pose = self.robot.links_map[TOOL].pose
+        return torch.cat([pose.p, torch.where(pose.q[..., :1] < 0, -pose.q, pose.q)], dim=-1)

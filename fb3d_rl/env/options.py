@@ -1,0 +1,143 @@
+"""Options of the simulated environment and the trial it is reset to; no simulator is imported here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.views import View
+from fb3d_rl.contract import UserError
+from fb3d_rl.flow.opening import openable_links, opening_range, start_fraction
+
+
+@dataclass(frozen=True)
+class GripperOptions:
+    """Limits and drives of the floating gripper.
+
+    Attributes:
+        v_max: speed of each slide at action 1, m/s.
+        w_max: speed of each hinge at action 1, rad/s.
+        f_max: speed of each finger at action 1, m/s.
+        force_limit: largest force of a slide's drive, N.
+        torque_limit: largest torque of a hinge's drive, N m.
+        finger_force_limit: largest force of a finger's drive, N.
+        damping: velocity gain of the slides, N s/m: how hard they resist a velocity other than the commanded one.
+        angular_damping: velocity gain of the hinges, N m s/rad.
+        distance: distance (m) of the hand's origin in front of the object at the start.
+    """
+
+    v_max: float = 1.0
+    w_max: float = 2.0
+    f_max: float = 0.05
+    force_limit: float = 3000.0
+    torque_limit: float = 300.0
+    finger_force_limit: float = 100.0
+    damping: float = 10000.0
+    angular_damping: float = 200.0
+    distance: float = 0.6
+
+
+@dataclass(frozen=True)
+class SuctionOptions:
+    """The spring that stands for suction (supplement, II.C: a strong force between gripper and part).
+
+    Attributes:
+        hold: "target" holds the part to open only, "any" every movable part.
+        stiffness: of the spring between tip and part, N/m.
+        damping: of the spring, N s/m.
+        angular_damping: of the hand's free turning about the anchor, N m s/rad.
+        breaking_force: the spring's force (N) above which suction is lost.
+        max_stretch: the spring's length (m) above which suction is lost.
+        touch: two surfaces that are closer than this (m), or press on each other, touch.
+        reach: how far (m) from the tip's centre a finger may touch and still suck.
+    """
+
+    hold: Literal["target", "any"] = "target"
+    stiffness: float = 45000.0
+    damping: float = 3000.0
+    angular_damping: float = 1.0
+    breaking_force: float = math.inf
+    max_stretch: float = 0.1
+    touch: float = 0.002
+    reach: float = 0.05
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """Options of the task.
+
+    Attributes:
+        gripper: drives of the gripper.
+        suction: the suction spring.
+        camera: optics of the depth camera.
+        points: number N of points of an observed cloud.
+        horizon: control steps after which an episode is truncated.
+        success: an episode succeeds below this normalized distance.
+        sim_freq: physics steps per second.
+        control_freq: control steps per second; divides ``sim_freq``.
+        gravity: whether gravity acts on the object (the gripper floats in any case). Off by default: PartNet-Mobility
+            objects span about 2 m, so a laptop's lid would weigh 90 kg.
+        joint_friction: PhysX's friction coefficient of the object's joints.
+        joint_damping: rate (1/s) at which a joint that nobody pushes loses its speed. It is per inertia, since parts
+            weigh from grams to 100 kg: light ones stay easy to open and heavy ones do not coast on after a push.
+        density: of the object's parts, kg/m^3.
+    """
+
+    gripper: GripperOptions = field(default_factory=GripperOptions)
+    suction: SuctionOptions = field(default_factory=SuctionOptions)
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    points: int = 1200
+    horizon: int = 150
+    success: float = 0.1
+    sim_freq: int = 100
+    control_freq: int = 20
+    gravity: bool = False
+    joint_friction: float = 0.1
+    joint_damping: float = 5.0
+    density: float = 1000.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One scheduled episode.
+
+    Attributes:
+        object: the object's id.
+        link: index of the link to open.
+        start: joint state [J] (rad or m) in the order of the object's ``movable``.
+        view: where the camera stands.
+        seed: of the random draws within the episode.
+    """
+
+    object: str
+    link: int
+    start: tuple[float, ...]
+    view: View
+    seed: int = 0
+
+
+def default_trial(obj: ArticulatedObject, link: int | None = None, view: View | None = None, seed: int = 0) -> Trial:
+    """The trial of the reference protocol: everything closed but the part to open, 20 % open in some categories.
+
+    Args:
+        obj: the object.
+        link: the link to open; the first openable one unless given.
+        view: the camera's view; from the front and 30 degrees above unless given.
+        seed: of the random draws within the episode.
+
+    Raises:
+        UserError: nothing of the object can be opened.
+    """
+    if link is None:
+        links = openable_links(obj)
+        if not links:
+            raise UserError(f"object {obj.id} has no part that opens; choose another object")
+        link = links[0]
+    closed, opened = opening_range(obj)
+    start = closed.copy()
+    j = obj.movable.index(link)
+    start[j] += start_fraction(obj.category) * (opened[j] - closed[j])
+    return Trial(obj.id, link, tuple(float(q) for q in start), view or View(0.0, 30.0), seed)

@@ -1,0 +1,141 @@
+"""Suction: a strong spring between the gripper's tip and the part that it touches (supplement, II.C)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fb3d_rl.env.options import SuctionOptions
+
+if TYPE_CHECKING:
+    import sapien
+    from sapien.physx import PhysxArticulationLinkComponent, PhysxContactPoint, PhysxDriveComponent
+
+Vector = NDArray[np.float64]
+
+
+class Suction:
+    """Holds the part that a finger of the gripper touches, until the spring breaks.
+
+    The spring is linear and acts between the tip and the touched link. It is anchored on both where they touch, so
+    that it is slack when it engages, and leaves the hand free to turn about the anchor.
+
+    Args:
+        scene: the scene of one environment.
+        tool: the link at the suction tip, on which the spring pulls.
+        fingers: links of the gripper whose touch engages suction.
+        body: all links of the gripper that have a shape; their contact force is measured.
+        parts: the links that may be held, by a number that names each; touching anything else never holds.
+        options: the spring's constants.
+    """
+
+    def __init__(
+        self,
+        scene: sapien.Scene,
+        tool: PhysxArticulationLinkComponent,
+        fingers: Sequence[PhysxArticulationLinkComponent],
+        body: Sequence[PhysxArticulationLinkComponent],
+        parts: Mapping[int, PhysxArticulationLinkComponent],
+        options: SuctionOptions,
+    ) -> None:
+        self.options = options
+        self.held: int | None = None
+        self.anchors: tuple[Vector, Vector] = (np.zeros(3), np.zeros(3))
+        self._scene, self._tool = scene, tool
+        self._fingers, self._body = frozenset(fingers), frozenset(body)
+        self._parts = dict(parts)
+        self._numbers = {link: number for number, link in parts.items()}
+        self._drive: PhysxDriveComponent | None = None
+        self._impulse = np.zeros(3)
+
+    @property
+    def attached(self) -> bool:
+        """Whether a part is held."""
+        return self.held is not None
+
+    @property
+    def stretch(self) -> float:
+        """Length of the spring, m (0 while nothing is held)."""
+        if self.held is None:
+            return 0.0
+        on_tool = _to_world(self._tool.entity_pose, self.anchors[0])
+        on_part = _to_world(self._parts[self.held].entity_pose, self.anchors[1])
+        return float(np.linalg.norm(on_tool - on_part))
+
+    def update(self) -> None:
+        """Look at the contacts of the physics step that was just made: hold, keep or lose a part."""
+        contacts = self._scene.physx_system.get_contacts()
+        touching: dict[int, list[Vector]] = {}
+        for contact in contacts:
+            first, second = contact.bodies
+            if first in self._body:
+                own, other, sign = first, second, 1.0
+            elif second in self._body:
+                own, other, sign = second, first, -1.0
+            else:
+                continue
+            points = contact.points
+            for point in points:
+                self._impulse += sign * point.impulse
+            number = self._numbers.get(other)
+            if number is not None and own in self._fingers and not self.attached:
+                touching.setdefault(number, []).extend(self._touches(points))
+        if self.attached:
+            stretch = self.stretch
+            if stretch > self.options.max_stretch or stretch * self.options.stiffness > self.options.breaking_force:
+                self.release()
+            return
+        found = {number: positions for number, positions in touching.items() if positions}
+        if found:
+            # The part with the touch nearest to the tip's centre; ties go to the lower number.
+            tip = np.asarray(self._tool.entity_pose.p, dtype=np.float64)
+            number = min(found, key=lambda n: (min(np.linalg.norm(p - tip) for p in found[n]), n))
+            where = np.mean(found[number], axis=0)
+            self.hold(
+                number,
+                _to_local(self._tool.entity_pose, where),
+                _to_local(self._parts[number].entity_pose, where),
+            )
+
+    def _touches(self, points: Sequence[PhysxContactPoint]) -> list[Vector]:
+        tip = np.asarray(self._tool.entity_pose.p, dtype=np.float64)
+        return [
+            position
+            for point in points
+            if (point.separation < self.options.touch or np.any(point.impulse))
+            and np.linalg.norm((position := np.asarray(point.position, dtype=np.float64)) - tip) < self.options.reach
+        ]
+
+    def hold(self, number: int, on_tool: Vector, on_part: Vector) -> None:
+        """Hold part ``number`` by a spring between the anchors [3] in the tool's and the part's frame, m."""
+        import sapien
+
+        self.release()
+        part = self._parts[number]
+        drive = self._scene.create_drive(self._tool, sapien.Pose(on_tool), part, sapien.Pose(on_part))
+        for set_axis in (drive.set_drive_property_x, drive.set_drive_property_y, drive.set_drive_property_z):
+            set_axis(self.options.stiffness, self.options.damping)
+        drive.set_drive_property_slerp(0.0, self.options.angular_damping)
+        self._drive, self.held, self.anchors = drive, number, (on_tool, on_part)
+
+    def release(self) -> None:
+        """Let go of the part, if one is held."""
+        if self._drive is not None:
+            self._drive.entity.remove_component(self._drive)
+        self._drive, self.held = None, None
+
+    def take_impulse(self) -> Vector:
+        """Net contact impulse [3] on the gripper (N s, world) since the last call."""
+        impulse, self._impulse = self._impulse, np.zeros(3)
+        return impulse
+
+
+def _to_world(pose: sapien.Pose, point: Vector) -> Vector:
+    return np.asarray(pose.to_transformation_matrix() @ np.append(point, 1.0))[:3]
+
+
+def _to_local(pose: sapien.Pose, point: Vector) -> Vector:
+    return np.asarray(pose.inv().to_transformation_matrix() @ np.append(point, 1.0))[:3]

@@ -1,0 +1,1 @@
+"""From trials to what people read: rows, tables with intervals, the report."""

@@ -1,0 +1,154 @@
+"""The evaluation stage of every command: scheduled trials, flow metrics, and the files that hold them."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensordict.nn import TensorDictModuleBase
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
+from fb3d_rl.evaluation.report import write_report
+from fb3d_rl.evaluation.rollout import run_trials
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_text, write_trials
+from fb3d_rl.evaluation.tables import show, summary
+from fb3d_rl.evaluation.trials import schedule
+from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.models.artflownet import ArtFlowNet
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What is evaluated, and how often.
+
+    Attributes:
+        samples: clouds, views and camera of trials and flow samples.
+        env: the task's constants.
+        trials: at most this many trials, None for all.
+        samples_per_object: flow samples of each object and target.
+        clouds: clouds kept for the report.
+        seed: base seed of trials and samples.
+    """
+
+    samples: SampleOptions
+    env: EnvOptions
+    trials: int | None
+    samples_per_object: int
+    clouds: int
+    seed: int
+
+
+def evaluate(
+    out: Path,
+    objects: Sequence[tuple[ArticulatedObject, str]],
+    policies: Mapping[str, TensorDictModuleBase],
+    protocol: Protocol,
+    facts: Mapping[str, Any],
+    net: ArtFlowNet | None = None,
+    device: torch.device | None = None,
+) -> list[TrialRow]:
+    """Run the trials with every policy, measure the flow network, and write the results below ``out``.
+
+    Writes rows.csv, flow_rows.csv and clouds.npz (with ``net``), summary.json and report.html, and prints the table.
+
+    Args:
+        out: the run folder.
+        objects: the objects with their splits.
+        policies: name -> policy.
+        protocol: what is evaluated.
+        facts: entries for summary.json (seed, command, git revision ...).
+        net: the flow network to measure.
+        device: where the network runs.
+
+    Returns:
+        One row for each scheduled trial and policy.
+    """
+    numbers: dict[str, Any] = dict(facts)
+    measured: list[FlowRow] = []
+    if net is not None:
+        measured, extra = _measure_flow(out, net, device or torch.device("cpu"), objects, protocol)
+        numbers |= extra
+        write_flow(out / "flow_rows.csv", measured)
+    scheduled, hidden = schedule(objects, protocol.samples, protocol.seed, protocol.trials)
+    numbers["n_hidden_parts"] = hidden
+    used = {item.trial.object for item in scheduled}
+    shown = [obj for obj, _ in objects if obj.id in used]
+    rows: list[TrialRow] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns) as bar:
+        for name, policy in policies.items():
+            task = bar.add_task(f"trials: {name}", total=len(scheduled))
+            rows += run_trials(name, policy, shown, scheduled, protocol.env, lambda row, t=task: bar.advance(t))
+            write_trials(out / "rows.csv", rows)
+    numbers = summary(rows, measured, numbers)
+    write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
+    show(numbers, Console())
+    report = write_report(out)
+    print(f"results: {out}\nreport:  {report}")
+    return rows
+
+
+def _measure_flow(
+    out: Path,
+    net: ArtFlowNet,
+    device: torch.device,
+    objects: Sequence[tuple[ArticulatedObject, str]],
+    protocol: Protocol,
+) -> tuple[list[FlowRow], dict[str, Any]]:
+    """Rows of the target "part"; the numbers of the target "all" for summary.json; clouds for the report."""
+    measured: list[FlowRow] = []
+    extra: dict[str, Any] = {}
+    net = net.to(device)
+    sets = held_out_samples(objects, protocol.samples, protocol.samples_per_object, protocol.seed)
+    for target, (samples, about) in sets.items():
+        predicted = predict(net, samples, device)
+        rows = flow_rows(predicted, samples, about)
+        if target == "part":
+            measured = rows
+            _keep_clouds(out / "clouds.npz", samples, predicted, about, protocol.clouds)
+            continue
+        everything = summary([], rows)
+        extra["flow_all_parts"] = {
+            key: value for key, value in everything.items() if key.startswith("flow/") or key == "by_split"
+        }
+    return measured, extra
+
+
+def _keep_clouds(path: Path, samples: Any, predicted: torch.Tensor, about: Sequence[Any], count: int) -> None:
+    """Save ``count`` clouds for the report, of as many categories as possible."""
+    by_category: dict[str, list[int]] = {}
+    for i, (obj, _, _) in enumerate(about):
+        by_category.setdefault(obj.category, []).append(i)
+    order: list[int] = []
+    for turn in range(max(map(len, by_category.values()))):
+        order += [rows[(turn * 7) % len(rows)] for rows in by_category.values() if turn < len(rows)]
+    chosen = list(dict.fromkeys(order))[:count]
+    cosine = flow_metrics(predicted, samples["privileged", "flow"], samples["observation", "valid"])["cosine"]
+    titles = [
+        f"{about[i][0].category} {about[i][0].id}, {about[i][0].links[about[i][0].index(about[i][2])].semantic}, "
+        f"cosine {cosine[i]:.3f}"
+        for i in chosen
+    ]
+    kept = samples[torch.tensor(chosen)]
+    np.savez_compressed(
+        path,
+        points=kept["observation", "points"].numpy(),
+        valid=kept["observation", "valid"].numpy(),
+        part_mask=kept["observation", "part_mask"].numpy(),
+        flow_true=kept["privileged", "flow"].numpy(),
+        flow_predicted=predicted[torch.tensor(chosen)].numpy(),
+        title=np.array(titles),
+    )

@@ -1,0 +1,181 @@
+"""The two tables that an evaluation leaves behind: a row per scheduled trial, a row per held-out flow sample.
+
+Columns keep the order of the fields and floats are written with ``repr``, so reading gives equal rows back.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from fb3d_rl.contract import UserError
+
+
+@dataclass(frozen=True)
+class TrialRow:
+    """One scheduled trial. What is left at its default describes a trial in which nothing was achieved.
+
+    Attributes:
+        trial: index in the schedule, shared by all policies.
+        policy: "expert", "artflownet", ...
+        object: the object's id; together with ``category`` the unit that is resampled for the intervals.
+        category: the object's category.
+        split: the split that the object belongs to.
+        link: name of the link to open.
+        semantic: what the link is ("door", "drawer", ...).
+        joint_type: "revolute", "continuous" or "prismatic".
+        seed: of this trial.
+        status: "error" for a trial that crashed.
+        error: what it crashed with.
+        steps: control steps taken.
+        contact: suction held the target part.
+        success: normalized distance below 0.1 at the end.
+        normalized_distance: |q_goal - q| / |q_goal - q_start| at the end.
+        attach_step: control step at which suction took hold, -1 if never.
+        failure: short reason why the part was not opened, "" on success.
+
+    Raises:
+        ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success
+            or a normalized distance other than 1: a crash counts as a failure.
+    """
+
+    trial: int
+    policy: str
+    object: str
+    category: str
+    split: str
+    link: str
+    semantic: str
+    joint_type: str
+    seed: int
+    status: Literal["ok", "error"] = "ok"
+    error: str = ""
+    steps: int = 0
+    contact: bool = False
+    success: bool = False
+    normalized_distance: float = 1.0
+    attach_step: int = -1
+    failure: str = ""
+
+    def __post_init__(self) -> None:
+        if self.status not in ("ok", "error"):
+            raise ValueError(f'status is {self.status!r}, not "ok" or "error"')
+        if not math.isfinite(self.normalized_distance):
+            raise ValueError(f"normalized_distance is {self.normalized_distance}")
+        if self.status == "error" and (self.contact or self.success or self.normalized_distance != 1.0):
+            raise ValueError("a crashed trial counts as a failure: no contact, no success, distance 1")
+
+
+@dataclass(frozen=True)
+class FlowRow:
+    """Flow metrics of one held-out sample, over its moving points (samples without any are not scheduled).
+
+    Attributes:
+        object: the object's id.
+        category: the object's category.
+        split: the split that the object belongs to.
+        link: name of the link that moves.
+        cosine: mean cosine between predicted and true flow.
+        rmse: mean L2 norm of the error, in units of the largest true flow of the cloud.
+        magnitude_error: mean absolute difference of the two norms, same unit.
+
+    Raises:
+        ValueError: a metric that is not finite.
+    """
+
+    object: str
+    category: str
+    split: str
+    link: str
+    cosine: float
+    rmse: float
+    magnitude_error: float
+
+    def __post_init__(self) -> None:
+        for name in ("cosine", "rmse", "magnitude_error"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} of {self.object} {self.link} is {getattr(self, name)}")
+
+
+Row = TypeVar("Row", TrialRow, FlowRow)
+
+_BOOLEANS = {"True": True, "False": False}
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace ``path`` by ``text`` (UTF-8) in one step: readers see the old or the new file, never half."""
+    # surrogateescape: error texts may quote file names whose bytes are not valid UTF-8.
+    beside = path.with_name(f".{path.name}.{os.getpid()}")
+    beside.write_bytes(text.encode("utf-8", "surrogateescape"))
+    os.replace(beside, path)
+
+
+def _write(path: Path, rows: Sequence[Row], kind: type[Row]) -> None:
+    text = io.StringIO(newline="")
+    writer = csv.writer(text)
+    writer.writerow([field.name for field in fields(kind)])
+    writer.writerows(astuple(row) for row in rows)  # csv writes floats with repr
+    write_text(path, text.getvalue())
+
+
+def _read(path: Path, kind: type[Row]) -> list[Row]:
+    columns = {field.name: str(field.type) for field in fields(kind)}
+    rows: list[Row] = []
+    try:
+        with path.open(newline="", encoding="utf-8", errors="surrogateescape") as file:
+            reader = csv.reader(file)
+            if next(reader, None) != list(columns):
+                raise UserError(f"{path} is of another version: its columns must be {', '.join(columns)}.")
+            for values in reader:
+                parsed = (_parse(value, type_) for value, type_ in zip(values, columns.values(), strict=True))
+                rows.append(kind(*parsed))
+    except (OSError, ValueError, KeyError, csv.Error) as error:
+        raise UserError(f"Cannot read {path}, row {len(rows) + 1}: {error}") from error
+    return rows
+
+
+def _parse(value: str, type_: str) -> Any:
+    if type_ == "int":
+        return int(value)
+    if type_ == "float":
+        return float(value)
+    return _BOOLEANS[value] if type_ == "bool" else value
+
+
+def write_trials(path: Path, rows: Sequence[TrialRow]) -> None:
+    """Write ``rows.csv`` atomically."""
+    _write(path, rows, TrialRow)
+
+
+def read_trials(path: Path) -> list[TrialRow]:
+    """Read ``rows.csv``.
+
+    Raises:
+        UserError: the file is missing, has other columns or a value of the wrong type.
+    """
+    return _read(path, TrialRow)
+
+
+def write_flow(path: Path, rows: Sequence[FlowRow]) -> None:
+    """Write ``flow_rows.csv`` atomically."""
+    _write(path, rows, FlowRow)
+
+
+def read_flow(path: Path) -> list[FlowRow]:
+    """Read ``flow_rows.csv``.
+
+    Raises:
+        UserError: the file is missing, has other columns or a value of the wrong type.
+    """
+    return _read(path, FlowRow)
+
+
+def policies(rows: Iterable[TrialRow]) -> list[str]:
+    """Names of the policies in ``rows``, in order of first appearance."""
+    return list(dict.fromkeys(row.policy for row in rows))

@@ -1,0 +1,81 @@
+"""The schedule of an evaluation: every trial is listed, with its view and seed, before the first one runs."""
+
+from __future__ import annotations
+
+import itertools
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.camera.views import ViewRange
+from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
+from fb3d_rl.env.options import Trial, default_trial
+
+
+@dataclass(frozen=True)
+class Scheduled:
+    """A trial with what its row tells about it."""
+
+    trial: Trial
+    category: str
+    split: str
+    link: str
+    semantic: str
+    joint_type: str
+
+
+def schedule(
+    objects: Sequence[tuple[ArticulatedObject, str]], options: SampleOptions, seed: int, limit: int | None = None
+) -> tuple[list[Scheduled], int]:
+    """List one trial for every part that opens and can be seen.
+
+    The view of a trial is drawn from ``options.views`` until the part shows at least ``MIN_VISIBLE`` points, eight
+    times at most. A trial depends on (seed, object, link) alone, not on the other objects.
+
+    Args:
+        objects: objects with their splits.
+        options: points of a cloud, views and camera.
+        seed: base seed.
+        limit: at most this many trials, taken from the categories in turn.
+
+    Returns:
+        The trials, by category, object and link, and how many openable parts no view showed.
+    """
+    found: dict[str, list[Scheduled]] = {}
+    hidden = 0
+    order = np.random.default_rng([seed, 2]).permutation(len(objects)).tolist()
+    for obj, split in (objects[i] for i in order):
+        if limit is not None and len(found.get(obj.category, ())) >= limit:
+            continue
+        view = ObjectView(obj, options.camera)
+        for link in view.openable:
+            trial = _visible_trial(view, link, options, seed)
+            if trial is None:
+                hidden += 1
+                continue
+            part = obj.links[link]
+            item = Scheduled(trial, obj.category, split, part.name, part.semantic, obj.joint_of(link).type)
+            found.setdefault(obj.category, []).append(item)
+    turns = itertools.chain.from_iterable(itertools.zip_longest(*(found[c] for c in sorted(found))))
+    chosen = [item for item in turns if item is not None][:limit]
+    return sorted(chosen, key=lambda s: (s.category, s.trial.object, s.trial.link)), hidden
+
+
+def _visible_trial(view: ObjectView, link: int, options: SampleOptions, seed: int, tries: int = 8) -> Trial | None:
+    rng = np.random.default_rng([seed, 3, zlib.crc32(view.obj.id.encode()), link])
+    number = int(rng.integers(2**31))
+    carried = view.obj.descendants(link)
+    for _ in range(tries):
+        trial = default_trial(view.obj, link, options.views.sample(rng), number)
+        _, links = view.cloud(np.array(trial.start), trial.view, options.points, rng)
+        if np.isin(links, carried).sum() >= MIN_VISIBLE:
+            return trial
+    return None
+
+
+def views_of(azimuth: Sequence[float], elevation: Sequence[float]) -> ViewRange:
+    """The view range of two [lowest, highest] pairs, degrees."""
+    return ViewRange((azimuth[0], azimuth[1]), (elevation[0], elevation[1]))

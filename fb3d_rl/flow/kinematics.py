@@ -1,0 +1,74 @@
+"""Forward kinematics of an articulated object, batched over joint states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.geometry.transforms import axis_angle_to_matrix, rigid
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicTree:
+    """The joint tree of one object as tensors; L links, parents first, J movable joints.
+
+    Attributes:
+        parents: parent's index of each link, -1 for the root.
+        origins: T_parent_joint [L, 4, 4] at joint position 0.
+        axes: unit joint axes [L, 3] in the joint's frame.
+        joint_index: position of each link's joint in a joint state, -1 for a fixed joint and the root.
+        prismatic: whether each link's joint slides.
+        descendants: [J, L] bool, the links that joint j moves (its own link and all that it carries).
+    """
+
+    parents: tuple[int, ...]
+    origins: Tensor
+    axes: Tensor
+    joint_index: tuple[int, ...]
+    prismatic: tuple[bool, ...]
+    descendants: Tensor
+
+    @classmethod
+    def from_object(cls, obj: ArticulatedObject, dtype: torch.dtype = torch.float64) -> KinematicTree:
+        """Build the tree of ``obj``; positions of a joint state are in the order of ``obj.movable``."""
+        joints = [link.joint for link in obj.links]
+        order = {link: j for j, link in enumerate(obj.movable)}
+        descendants = torch.zeros(len(obj.movable), len(obj.links), dtype=torch.bool)
+        for j, link in enumerate(obj.movable):
+            descendants[j, list(obj.descendants(link))] = True
+        return cls(
+            parents=tuple(link.parent for link in obj.links),
+            origins=torch.as_tensor(
+                np.stack([np.eye(4) if joint is None else joint.origin for joint in joints]), dtype=dtype
+            ),
+            axes=torch.as_tensor(
+                np.stack([np.zeros(3) if joint is None else joint.axis for joint in joints]), dtype=dtype
+            ),
+            joint_index=tuple(order.get(i, -1) for i in range(len(obj.links))),
+            prismatic=tuple(joint is not None and joint.type == "prismatic" for joint in joints),
+            descendants=descendants,
+        )
+
+    def forward(self, qpos: Tensor) -> Tensor:
+        """Link poses T_base_link [..., L, 4, 4] at joint states ``qpos`` [..., J] (rad or m)."""
+        qpos = qpos.to(self.origins.dtype)
+        batch = qpos.shape[:-1]
+        eye = torch.eye(3, dtype=qpos.dtype, device=qpos.device)
+        poses: list[Tensor] = []
+        for i, parent in enumerate(self.parents):
+            pose = self.origins[i].expand(*batch, 4, 4)
+            if parent >= 0:
+                pose = poses[parent] @ pose
+            if (j := self.joint_index[i]) >= 0:
+                axis, position = self.axes[i], qpos[..., j]
+                if self.prismatic[i]:
+                    moved = rigid(eye, axis * position[..., None])
+                else:
+                    moved = rigid(axis_angle_to_matrix(axis.expand(*batch, 3), position), torch.zeros_like(axis))
+                pose = pose @ moved
+            poses.append(pose)
+        return torch.stack(poses, dim=-3)

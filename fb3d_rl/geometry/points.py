@@ -1,0 +1,193 @@
+"""Point operations on padded batches of clouds: sampling, neighbours, gathering, PCA curvature.
+
+Shapes: B clouds, N points each, M centres, K neighbours. ``valid`` is False on padding: a padding point is
+never sampled, grouped or interpolated from. All is plain PyTorch, runs on CPU and CUDA, and gives the same
+bits every time on a CPU.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def _all_valid(points: Tensor, valid: Tensor | None) -> Tensor:
+    return torch.ones(points.shape[:2], dtype=torch.bool, device=points.device) if valid is None else valid
+
+
+def squared_distances(points: Tensor, others: Tensor) -> Tensor:
+    """Squared distances (m^2) between points [B, N, 3] and others [B, M, 3] -> [B, N, M].
+
+    Differences are squared directly: the shorter |a|^2 - 2ab + |b|^2 loses digits on close points.
+    """
+    total = (points[:, :, None, 0] - others[:, None, :, 0]).square_()
+    for axis in (1, 2):
+        total += (points[:, :, None, axis] - others[:, None, :, axis]).square_()
+    return total
+
+
+@torch.no_grad()
+def farthest_point_sample(points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
+    """Pick ``count`` points that cover each cloud (Eldar et al. 1997).
+
+    Deterministic: starts at the first valid point, and a tie goes to the lower index. Where a cloud has fewer
+    than ``count`` distinct valid points, valid points repeat; a cloud with none gives index 0.
+
+    Args:
+        points: [B, N, 3].
+        count: how many to pick.
+        valid: [B, N] bool, or None for all.
+
+    Returns:
+        Indices [B, count], int64. The first m of them are the answer to ``count=m``.
+    """
+    valid = _all_valid(points, valid)
+    coordinates = points.permute(2, 0, 1).contiguous()
+    distance = torch.full(points.shape[:2], torch.inf, device=points.device, dtype=points.dtype)
+    distance.masked_fill_(~valid, -1.0)
+    chosen = torch.empty(points.shape[0], count, dtype=torch.int64, device=points.device)
+    current = valid.to(torch.uint8).argmax(1, keepdim=True)
+    scratch, step = torch.empty_like(distance), torch.empty_like(distance)
+    for i in range(count):
+        chosen[:, i : i + 1] = current
+        for axis, values in enumerate(coordinates):
+            torch.sub(values, values.gather(1, current), out=step)
+            if axis == 0:
+                torch.mul(step, step, out=scratch)
+            else:
+                scratch.addcmul_(step, step)
+        torch.minimum(distance, scratch, out=distance)
+        current = distance.argmax(1, keepdim=True)
+    return chosen
+
+
+@torch.no_grad()
+def ball_query(
+    points: Tensor, centres: Tensor, radius: float, count: int, valid: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """The first ``count`` valid points, by index, within ``radius`` of each centre.
+
+    Clouds come in random order, so the first by index are an unbiased sample of an overfull ball; keeping the
+    nearest, or those first in a search tree, shrinks or skews the neighbourhood.
+
+    Args:
+        points: [B, N, 3].
+        centres: [B, M, 3], same frame.
+        radius: in the unit of the points, inclusive.
+        count: K, the most neighbours kept.
+        valid: [B, N] bool, or None for all.
+
+    Returns:
+        Indices [B, M, K] int64 and a mask [B, M, K] that is True on real neighbours, which come first.
+        Free slots hold the ball's first neighbour (0 where the ball is empty).
+    """
+    valid = _all_valid(points, valid)
+    batch, rows = centres.shape[:2]
+    inside = torch.empty(batch, rows, points.shape[1], dtype=torch.bool, device=points.device)
+    # One cloud at a time on a CPU, so that its distances stay in the cache.
+    size = 1 if points.device.type == "cpu" else batch
+    for start in range(0, batch, size):
+        part = slice(start, start + size)
+        torch.le(squared_distances(centres[part], points[part]), radius * radius, out=inside[part])
+        inside[part] &= valid[part, None]
+    inside = inside.view(batch * rows, -1)
+    degree = inside.sum(1)
+    owner, found = inside.nonzero(as_tuple=True)
+    rank = torch.arange(len(owner), device=owner.device) - (degree.cumsum(0) - degree)[owner]
+    kept = rank < count
+    owner, found, rank = owner[kept], found[kept], rank[kept]
+    index = torch.zeros(batch * rows, count, dtype=torch.int64, device=points.device)
+    index[owner, rank] = found
+    mask = torch.arange(count, device=points.device) < degree[:, None]
+    index = torch.where(mask, index, index[:, :1])
+    return index.view(batch, rows, count), mask.view(batch, rows, count)
+
+
+@torch.no_grad()
+def knn(points: Tensor, queries: Tensor, count: int, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """The ``count`` nearest valid points of each query, nearest first.
+
+    Args:
+        points: [B, N, 3], searched.
+        queries: [B, M, 3].
+        count: K. Where a cloud has fewer valid points, the last slots have an infinite distance.
+        valid: [B, N] bool, or None for all.
+
+    Returns:
+        Squared distances [B, M, K] and indices [B, M, K]; with N < K, K shrinks to N.
+    """
+    valid = _all_valid(points, valid)
+    count = min(count, points.shape[1])
+    shape = (*queries.shape[:2], count)
+    distance = torch.empty(shape, dtype=points.dtype, device=points.device)
+    index = torch.empty(shape, dtype=torch.int64, device=points.device)
+    size = 1 if points.device.type == "cpu" else len(points)
+    for start in range(0, len(points), size):
+        part = slice(start, start + size)
+        squared = squared_distances(queries[part], points[part]).masked_fill_(~valid[part, None], torch.inf)
+        distance[part], index[part] = squared.topk(count, dim=2, largest=False)
+    return distance, index
+
+
+@torch.no_grad()
+def three_nn(points: Tensor, queries: Tensor, valid: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Indices and inverse-squared-distance weights for interpolation (PointNet++, section 3.4, k = 3, p = 2).
+
+    Args:
+        points: [B, N, 3], interpolated from.
+        queries: [B, M, 3].
+        valid: [B, N] bool, or None for all.
+
+    Returns:
+        Indices [B, M, 3] and weights [B, M, 3] that sum to 1 (0 in a cloud without valid points); fewer than
+        three columns where N < 3.
+    """
+    squared, index = knn(points, queries, 3, valid)
+    weight = squared.clamp_(min=1e-16).reciprocal_()
+    return index, weight / weight.sum(2, keepdim=True).clamp_(min=torch.finfo(weight.dtype).tiny)
+
+
+def gather(values: Tensor, index: Tensor) -> Tensor:
+    """Rows of values [B, N, C] at index [B, ...] -> [B, ..., C]."""
+    cloud = torch.arange(len(values), device=values.device).view(-1, *[1] * (index.dim() - 1))
+    return values[cloud, index]
+
+
+def take_rows(rows: Tensor, index: Tensor) -> Tensor:
+    """Rows [P, C] at index [...] -> [..., C]. Its gradient adds up in a fixed order, unlike that of
+    ``rows[index]``.
+    """
+    return functional.embedding(index, rows)
+
+
+def pca_curvature(
+    points: Tensor, neighbors: int = 16, valid: Tensor | None = None, viewpoint: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Surface variation and normals from the covariance of each point's nearest neighbours (Pauly et al.
+    2002).
+
+    Args:
+        points: [B, N, 3].
+        neighbors: how many nearest valid points, the point itself included, make the covariance.
+        valid: [B, N] bool, or None for all.
+        viewpoint: [B, 3] in the points' frame; normals are turned towards it. None leaves their sign open.
+
+    Returns:
+        Curvature [B, N], the least eigenvalue over the sum of the three: 0 on a plane, at most 1/3; and unit
+        normals [B, N, 3]. Both are 0 on padding.
+    """
+    valid = _all_valid(points, valid)
+    squared, index = knn(points, points, neighbors, valid)
+    weight = squared.isfinite().to(points.dtype)[..., None]
+    local = gather(points, index)
+    total = weight.sum(2, keepdim=True).clamp(min=1.0)
+    local = (local - (local * weight).sum(2, keepdim=True) / total) * weight
+    values, vectors = torch.linalg.eigh(local.transpose(2, 3) @ local / total)
+    values = values.clamp(min=0.0)
+    normals = vectors[..., 0]
+    if viewpoint is not None:
+        away = ((viewpoint[:, None] - points) * normals).sum(2, keepdim=True) < 0
+        normals = torch.where(away, -normals, normals)
+    curvature = values[..., 0] / values.sum(2).clamp(min=torch.finfo(values.dtype).tiny)
+    return curvature * valid, normals * valid[..., None]

@@ -1,0 +1,131 @@
+"""Rigid transforms and rotations.
+
+Conventions (one statement for the whole package): ``T_ab`` is a 4x4 matrix that maps column vectors in frame b to
+frame a; quaternions are wxyz with w >= 0; rotation vectors are axis * angle (rad); every function is batched over
+leading dimensions and keeps dtype and device.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def normalize(vectors: Tensor, eps: float = 1e-12) -> Tensor:
+    """Scale vectors [..., D] to unit length; vectors shorter than ``eps`` become 0."""
+    norm = vectors.norm(dim=-1, keepdim=True)
+    return torch.where(norm > eps, vectors / norm.clamp_min(eps), torch.zeros_like(vectors))
+
+
+def skew(vectors: Tensor) -> Tensor:
+    """Cross-product matrices [..., 3, 3] of vectors [..., 3]: ``skew(a) @ b == a x b``."""
+    x, y, z = vectors.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(rows, dim=-1).reshape(*vectors.shape[:-1], 3, 3)
+
+
+def axis_angle_to_matrix(axis: Tensor, angle: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] about unit ``axis`` [..., 3] by ``angle`` [...] rad (Rodrigues' formula)."""
+    k = skew(axis)
+    angle = angle[..., None, None]
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return eye + torch.sin(angle) * k + (1 - torch.cos(angle)) * (k @ k)
+
+
+def matrix_to_quaternion(rotation: Tensor) -> Tensor:
+    """Quaternions wxyz [..., 4], w >= 0, of rotation matrices [..., 3, 3].
+
+    Each component is read from the numerically best of the four classic branches, so rotations by pi are exact.
+    """
+    m = rotation
+    d0, d1, d2 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    w, x, y, z = 1 + d0 + d1 + d2, 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2
+    s21, d21 = m[..., 2, 1] + m[..., 1, 2], m[..., 2, 1] - m[..., 1, 2]
+    s02, d02 = m[..., 0, 2] + m[..., 2, 0], m[..., 0, 2] - m[..., 2, 0]
+    s10, d10 = m[..., 1, 0] + m[..., 0, 1], m[..., 1, 0] - m[..., 0, 1]
+    candidates = torch.stack(
+        [
+            torch.stack([w, d21, d02, d10], -1),
+            torch.stack([d21, x, s10, s02], -1),
+            torch.stack([d02, s10, y, s21], -1),
+            torch.stack([d10, s02, s21, z], -1),
+        ],
+        dim=-2,
+    )
+    best = torch.stack([w, x, y, z], -1).argmax(-1)[..., None, None].expand(*m.shape[:-2], 1, 4)
+    quaternion = normalize(candidates.gather(-2, best).squeeze(-2))
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4] (normalised first)."""
+    w, x, y, z = normalize(quaternion).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).reshape(*quaternion.shape[:-1], 3, 3)
+
+
+def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Transforms [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
+    batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3).unsqueeze(-1)], dim=-1)
+    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
+    return torch.cat([top, bottom.expand(*batch, 1, 4)], dim=-2)
+
+
+def inverse(transform: Tensor) -> Tensor:
+    """``T_ba`` of rigid ``T_ab`` [..., 4, 4]."""
+    rotation = transform[..., :3, :3].mT
+    return rigid(rotation, -(rotation @ transform[..., :3, 3:]).squeeze(-1))
+
+
+def apply(transform: Tensor, points: Tensor) -> Tensor:
+    """Map points [..., N, 3] by rigid transforms [..., 4, 4]."""
+    return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
+
+
+def alignment(source: Tensor, target: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] (rad) of the shortest rotation that takes ``source`` to ``target`` [..., 3].
+
+    Supplement I.F with its two slips mended: the angle is ``phi_12`` about the *unit* axis ``v1 x v2 / |v1 x v2|``
+    (the text halves ``omega`` in place of ``phi_12`` and leaves the axis unnormalised), and opposite vectors turn by
+    pi about an axis perpendicular to both, where the cross product vanishes. ``phi_12`` is taken by atan2, which
+    unlike arccos keeps its digits near 0 and pi. A zero vector aligns with anything: rotation 0.
+    """
+    a, b = normalize(source), normalize(target)
+    cross = torch.linalg.cross(a, b)
+    sine, cosine = cross.norm(dim=-1, keepdim=True), (a * b).sum(-1, keepdim=True)
+    angle = torch.atan2(sine, cosine)
+    # Perpendicular to a: cross with the coordinate axis along which a is shortest.
+    shortest = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
+    fallback = normalize(torch.linalg.cross(a, shortest))
+    axis = torch.where(sine > 1e-7, cross / sine.clamp_min(1e-7), fallback)
+    defined = (a.norm(dim=-1, keepdim=True) > 0) & (b.norm(dim=-1, keepdim=True) > 0)
+    return torch.where(defined & (angle > 1e-7), axis * angle, torch.zeros_like(a))
+
+
+def rotation_vector_to_matrix(vector: Tensor) -> Tensor:
+    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (rad)."""
+    return axis_angle_to_matrix(normalize(vector), vector.norm(dim=-1))
+
+
+def euler_xyz_to_matrix(angles: Tensor) -> Tensor:
+    """``Rx(roll) @ Ry(pitch) @ Rz(yaw)`` [..., 3, 3] of angles [..., 3] rad: a chain of x, y and z hinges."""
+    eye = torch.eye(3, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], 3, 3)
+    rx, ry, rz = (axis_angle_to_matrix(eye[..., i, :], angles[..., i]) for i in range(3))
+    return rx @ ry @ rz
+
+
+def euler_xyz_jacobian(angles: Tensor) -> Tensor:
+    """Jacobian [..., 3, 3] with ``omega_world = J @ angle_rates`` for :func:`euler_xyz_to_matrix`.
+
+    Its columns are the world directions of the three hinges: x, ``Rx`` y and ``Rx Ry`` z.
+    """
+    eye = torch.eye(3, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], 3, 3)
+    rx = axis_angle_to_matrix(eye[..., 0, :], angles[..., 0])
+    ry = axis_angle_to_matrix(eye[..., 1, :], angles[..., 1])
+    return torch.stack([eye[..., :, 0], rx[..., :, 1], (rx @ ry)[..., :, 2]], dim=-1)

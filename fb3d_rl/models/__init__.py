@@ -1,0 +1,1 @@
+"""Networks: PointNet++ and ArtFlowNet."""

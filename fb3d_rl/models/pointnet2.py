@@ -1,0 +1,196 @@
+"""PointNet++ (Qi et al. 2017) for one output vector per point, in plain PyTorch.
+
+    N points -> SA1: 20 % of them, balls of 0.2 m, MLP 64-64-128
+             -> SA2: 25 % of those, balls of 0.4 m, MLP 128-128-256
+             -> SA3: one vector for the cloud, MLP 256-512-1024
+    and back: FP3 256-256 (copied), FP2 256-128 and FP1 128-128-128 (3 nearest, inverse squared distance)
+             -> head 128-128-outputs
+
+Every MLP layer is linear, batch norm, ReLU. Geometry works on padded clouds [B, N, 3] with a mask; features
+live in flat rows [P, C], one row for each *valid* point of the batch, so that padding reaches neither batch
+norm nor a maximum.
+
+What makes it fast without a compiled extension, all of it exact:
+    - a layer on neighbours relative to a centre is linear: W(p - c) = Wp - Wc is computed per point and per
+      centre, not per pair; a layer on interpolated features commutes with the interpolation in the same way;
+    - the layers inside a ball run in blocks that fit a cache, and forward and backward share one function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from fb3d_rl.geometry import points as ops
+from fb3d_rl.models.dense import DenseMLP
+from fb3d_rl.models.grouped import Grouping, grouped_max, make_grouping
+
+
+@dataclass
+class Level:
+    """The points of one resolution.
+
+    Attributes:
+        points: [B, N, 3] m.
+        valid: [B, N] bool.
+        row: [B, N] the point's row among all valid points of the batch; on padding, of some other point.
+        total: P, the number of valid points.
+    """
+
+    points: Tensor
+    valid: Tensor
+    row: Tensor
+    total: int
+
+    @classmethod
+    def of(cls, points: Tensor, valid: Tensor) -> Level:
+        """Number the valid points."""
+        row = valid.flatten().cumsum(0).view_as(valid)
+        return cls(points, valid, (row - 1).clamp_(min=0), int(row[-1, -1]))
+
+    def flat(self, values: Tensor) -> Tensor:
+        """Values [B, N, ...] -> [P, ...]."""
+        return values.flatten(0, 1) if self.total == self.valid.numel() else values[self.valid]
+
+    def coarser(self, ratio: float) -> Level:
+        """Farthest points, ceil(ratio * number of valid points) of each cloud."""
+        most = -int(-ratio * self.valid.shape[1] // 1)
+        chosen = ops.farthest_point_sample(self.points, most, self.valid)
+        count = torch.ceil(self.valid.sum(1, keepdim=True) * ratio)
+        keep = torch.arange(most, device=chosen.device) < count
+        return Level.of(ops.gather(self.points, chosen), keep)
+
+
+class SetAbstraction(nn.Module):
+    """Gather each centre's ball, run a three-layer MLP on (features, position relative to the centre), take
+    the maximum.
+    """
+
+    def __init__(self, inputs: int, widths: Sequence[int], ratio: float, radius: float, neighbors: int) -> None:
+        super().__init__()
+        if len(widths) != 3:
+            raise ValueError(f"A set abstraction has three layers, not {len(widths)}.")
+        self.layers = DenseMLP(inputs + 3, *widths)
+        self.inputs, self.ratio, self.radius, self.neighbors = inputs, ratio, radius, neighbors
+
+    @torch.no_grad()
+    def group(self, fine: Level) -> tuple[Level, Grouping]:
+        """Choose centres and their neighbours; depends on the geometry only."""
+        coarse = fine.coarser(self.ratio)
+        index, mask = ops.ball_query(fine.points, coarse.points, self.radius, self.neighbors, fine.valid)
+        rows = fine.row.gather(1, index.flatten(1)).view_as(index)
+        return coarse, make_grouping(coarse.flat(rows), coarse.flat(mask), fine.total)
+
+    def forward(self, features: Tensor | None, fine: Level) -> tuple[Tensor, Level]:
+        """Features [P, inputs] (None if inputs = 0) of the fine points -> [Q, widths[-1]] and the coarse
+        points.
+        """
+        coarse, grouping = self.group(fine)
+        first = next(iter(self.layers)).linear.weight
+        place = first[:, self.inputs :]
+        of_points = fine.flat(fine.points) @ place.T
+        if features is not None:
+            of_points = of_points + features @ first[:, : self.inputs].T
+        of_centres = coarse.flat(coarse.points) @ place.T
+        return grouped_max(of_points, of_centres, grouping, self.layers), coarse
+
+
+class GlobalAbstraction(nn.Module):
+    """MLP on (features, position), then the maximum over each cloud."""
+
+    def __init__(self, inputs: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.layers = DenseMLP(inputs + 3, *widths)
+
+    def forward(self, features: Tensor, level: Level) -> Tensor:
+        """Features [Q, inputs] -> [B, widths[-1]]; 0 for a cloud without points."""
+        rows = self.layers(torch.cat([features, level.flat(level.points)], 1))
+        padded = ops.take_rows(rows, level.row)
+        # Features after ReLU are not negative, so that 0 is neutral in the maximum.
+        return padded.masked_fill(~level.valid[..., None], 0.0).amax(1)
+
+
+class FeaturePropagation(nn.Module):
+    """Interpolate coarse features at finer points, join the finer points' own features, run an MLP."""
+
+    def __init__(self, inputs: int, skip: int, widths: Sequence[int]) -> None:
+        super().__init__()
+        self.layers = DenseMLP(inputs + skip, *widths)
+        self.inputs = inputs
+
+    def forward(self, features: Tensor, coarse: Level | None, skip: Tensor | None, fine: Level) -> Tensor:
+        """Carry features to the finer level.
+
+        Args:
+            features: [Q, inputs] of the coarse points; [B, inputs], one row a cloud, if coarse is None.
+            coarse: the points that the features belong to.
+            skip: [P, skip] of the fine points, or None.
+            fine: the points to carry to.
+
+        Returns:
+            [P, widths[-1]].
+        """
+        first, *others = self.layers
+        weight = first.linear.weight
+        rows = features @ weight[:, : self.inputs].T
+        if coarse is None:
+            clouds = torch.arange(len(rows), device=rows.device)[:, None].expand_as(fine.valid)
+            rows = ops.take_rows(rows, fine.flat(clouds))
+        else:
+            with torch.no_grad():
+                index, share = ops.three_nn(coarse.points, fine.points, coarse.valid)
+                index = coarse.row.gather(1, index.flatten(1)).view_as(index)
+            rows = functional.embedding_bag(fine.flat(index), rows, per_sample_weights=fine.flat(share), mode="sum")
+        if skip is not None:
+            rows = rows + skip @ weight[:, self.inputs :].T
+        rows = first.activate(rows)
+        for layer in others:
+            rows = layer(rows)
+        return rows
+
+
+class PointNet2(nn.Module):
+    """PointNet++ with a vector of ``outputs`` numbers for each point.
+
+    Args:
+        inputs: feature channels of each point beside its position.
+        outputs: numbers for each point.
+        neighbors: points kept in a ball.
+
+    Shapes:
+        points [B, N, 3] m, valid [B, N] bool, features [B, N, inputs] or None -> [B, N, outputs], 0 on
+        padding.
+    """
+
+    def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
+        super().__init__()
+        self.outputs = outputs
+        self.sa1 = SetAbstraction(inputs, (64, 64, 128), ratio=0.2, radius=0.2, neighbors=neighbors)
+        self.sa2 = SetAbstraction(128, (128, 128, 256), ratio=0.25, radius=0.4, neighbors=neighbors)
+        self.sa3 = GlobalAbstraction(256, (256, 512, 1024))
+        self.fp3 = FeaturePropagation(1024, 256, (256, 256))
+        self.fp2 = FeaturePropagation(256, 128, (256, 128))
+        self.fp1 = FeaturePropagation(128, inputs, (128, 128, 128))
+        self.head = nn.Sequential(DenseMLP(128, 128, 128), nn.Linear(128, outputs))
+
+    def forward(self, points: Tensor, valid: Tensor, features: Tensor | None = None) -> Tensor:
+        """See the class."""
+        level0 = Level.of(points, valid)
+        if level0.total == 0:
+            return points.new_zeros(*valid.shape, self.outputs)
+        own = None if features is None else level0.flat(features)
+        fine, level1 = self.sa1(own, level0)
+        middle, level2 = self.sa2(fine, level1)
+        whole = self.sa3(middle, level2)
+        middle = self.fp3(whole, None, middle, level2)
+        fine = self.fp2(middle, level2, fine, level1)
+        rows = self.head(self.fp1(fine, level1, own, level0))
+        if level0.total == valid.numel():
+            return rows.view(*valid.shape, -1)
+        output = rows.new_zeros(*valid.shape, self.outputs)
+        output[valid] = rows
+        return output

@@ -1,0 +1,1 @@
+"""Policies: TensorDict in, TensorDict out; none of them knows the environment."""

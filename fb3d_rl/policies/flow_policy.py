@@ -1,0 +1,279 @@
+"""The flow policy: approach a point against its flow, touch, hold, then pull along the current flow.
+
+It does not know where its flow comes from. Fed the ground truth it is the expert; fed ArtFlowNet's prediction it is
+FlowBot3D. It is batched over environments, and its state travels in the TensorDict under "policy".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+
+from fb3d_rl.contract import ACTION_DIM
+from fb3d_rl.geometry.transforms import (
+    alignment,
+    euler_xyz_jacobian,
+    normalize,
+    quaternion_to_matrix,
+    rotation_vector_to_matrix,
+)
+from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
+from fb3d_rl.perception.contact import ContactOptions, choose_contact
+
+SELECT, TRAVEL, APPROACH, PULL, RETREAT = range(5)
+"""Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2 and 4, articulation execution (I.G) is 3."""
+
+TRIES = 6
+"""Contact points that are remembered as tried in vain."""
+
+
+@dataclass(frozen=True)
+class FlowPolicyOptions:
+    """Speeds, gains and distances of the flow policy.
+
+    Attributes:
+        travel_speed: of the tip around the object, m/s.
+        approach_speed: of the tip on the way to the pre-contact point, m/s.
+        touch_speed: of the tip from there on (guarded), m/s.
+        pull_speed: factor that turns the normalised flow into a tip velocity (I.G), m/s.
+        angular_gain: factor that turns the rotation q_diff into an angular velocity (I.G), 1/s.
+        precontact: distance (m) of the pre-contact point in front of the contact point (I.G).
+        overshoot: how far (m) the tip may pass the contact point before the approach has failed.
+        force: contact force (N) that ends an approach which does not hold.
+        patience: control steps for which that force is borne, since suction may still engage.
+        retry_distance: points nearer (m) than this to a point tried in vain are not tried.
+        neighbors: nearest moving points whose mean flow is the flow at the held point.
+        margin: distance (m) that the tip keeps from the object's bounding sphere while it travels.
+    """
+
+    travel_speed: float = 1.8
+    approach_speed: float = 1.0
+    touch_speed: float = 0.3
+    pull_speed: float = 0.8
+    angular_gain: float = 8.0
+    precontact: float = 0.1
+    overshoot: float = 0.08
+    force: float = 20.0
+    patience: int = 4
+    retry_distance: float = 0.08
+    neighbors: int = 8
+    margin: float = 0.1
+    contact: ContactOptions = field(default_factory=ContactOptions)
+
+
+@dataclass(frozen=True)
+class VelocityLimits:
+    """What action 1 means: m/s, rad/s; has to be the gripper's."""
+
+    linear: float
+    angular: float
+
+
+class FlowPolicy(TensorDictModuleBase):
+    """Turns a flow into gripper velocities.
+
+    Args:
+        flow_key: where the flow is read: ``("privileged", "flow")`` makes the expert, ``("prediction", "flow")``
+            FlowBot3D.
+        limits: the gripper's velocity limits.
+        options: speeds, gains and distances.
+
+    Shapes: reads the contract's "observation" group and the flow [E, N, 3]; writes ``action`` [E, 8] and the next
+    step's state under ``("next", "policy")``, whose layout :meth:`initial_state` gives.
+    """
+
+    STATE: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+        "phase": ((1,), torch.int64),
+        "contact_point": ((3,), torch.float32),
+        "contact_flow": ((3,), torch.float32),
+        "standoff": ((3,), torch.float32),
+        "pull": ((3,), torch.float32),
+        "pressed": ((1,), torch.int64),
+        "tried": ((TRIES, 3), torch.float32),
+        "tries": ((1,), torch.int64),
+    }
+
+    def __init__(
+        self, flow_key: tuple[str, str], limits: VelocityLimits, options: FlowPolicyOptions | None = None
+    ) -> None:
+        super().__init__()
+        self.flow_key = flow_key
+        self.limits = limits
+        self.options = options or FlowPolicyOptions()
+        observed = ("points", "valid", "part_mask", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
+        self.in_keys = [("observation", key) for key in observed] + [flow_key]
+        self.in_keys += [("policy", key) for key in self.STATE]
+        self.out_keys = ["action"] + [("next", "policy", key) for key in self.STATE]
+
+    @classmethod
+    def initial_state(cls, batch: torch.Size | tuple[int, ...]) -> TensorDict:
+        """The state at the start of an episode: all zeros, phase SELECT."""
+        zeros = {key: torch.zeros(*batch, *shape, dtype=dtype) for key, (shape, dtype) in cls.STATE.items()}
+        return TensorDict(zeros, batch_size=batch)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action and the next policy state."""
+        o, obs = self.options, tensordict["observation"]
+        state = tensordict["policy"].clone()
+        tip, hand = obs["tool_pose"][..., :3], self._hand_axis(obs["tool_pose"])
+        flow = torch.where((obs["part_mask"] & obs["valid"])[..., None], tensordict[self.flow_key], 0.0)
+
+        self._advance(state, obs, flow, tip, hand)
+        phase = state["phase"]
+        velocity = self._path_velocity(state, obs, tip)
+        pull = self._flow_at(obs, flow, tip, state["pull"])
+        state["pull"] = torch.where(phase == PULL, pull, state["contact_flow"])
+        velocity = torch.where(phase == PULL, o.pull_speed * normalize(pull), velocity)
+
+        # The hand keeps its angle to the flow: what turns the flow at contact into the flow now turns the hand.
+        turned = rotation_vector_to_matrix(alignment(state["contact_flow"], state["pull"]))
+        wanted = (turned @ state["standoff"][..., None]).squeeze(-1)
+        angular = o.angular_gain * alignment(hand, wanted)
+        tensordict["action"] = self._joint_velocities(obs, tip, hand, velocity, angular)
+        tensordict["next", "policy"] = state
+        return tensordict
+
+    @staticmethod
+    def _hand_axis(tool_pose: Tensor) -> Tensor:
+        """v_1 of I.F [E, 3]: from the suction tip to the hand, which is the tool frame's -x axis."""
+        return -quaternion_to_matrix(tool_pose[..., 3:])[..., 0]
+
+    def _advance(self, state: TensorDictBase, obs: TensorDictBase, flow: Tensor, tip: Tensor, hand: Tensor) -> None:
+        """Move every environment to the phase that its observation calls for."""
+        o = self.options
+        phase = state["phase"].squeeze(-1)
+        attached = obs["attached"].squeeze(-1)
+
+        pressed = obs["contact_force"].squeeze(-1) > o.force
+        count = torch.where(pressed & (phase == APPROACH), state["pressed"].squeeze(-1) + 1, 0)
+        state["pressed"] = count[:, None]
+        offset = tip - state["contact_point"]
+        height = (offset * state["standoff"]).sum(-1)
+        failed = (phase == APPROACH) & ((count > o.patience) | (height < -o.overshoot)) & ~attached
+        lost = (phase == PULL) & ~attached
+        given_up = failed | lost
+        slot = (state["tries"] % TRIES)[..., None].expand(-1, 1, 3)
+        remembered = state["tried"].scatter(1, slot, state["contact_point"][:, None])
+        state["tried"] = torch.where(failed[:, None, None], remembered, state["tried"])
+        state["tries"] = state["tries"] + failed[:, None].long()
+
+        backed_off = (phase == RETREAT) & (height > o.precontact)
+        aligned = alignment(hand, state["standoff"]).norm(dim=-1) < 0.15
+        on_line = (offset - height[:, None] * state["standoff"]).norm(dim=-1) < 0.04
+        ready = (phase == TRAVEL) & aligned & on_line & (height > 0)
+        phase = torch.where(ready, APPROACH, phase)
+        phase = torch.where(given_up, RETREAT, phase)
+        phase = torch.where(backed_off, SELECT, phase)
+        phase = torch.where(attached, PULL, phase)
+        choosing = phase == SELECT
+        caught = attached & (state["contact_flow"].norm(dim=-1) == 0)  # held before a point was chosen
+        if bool((choosing | caught).any()):
+            chosen = choose_contact(
+                obs["points"], obs["valid"], flow, obs["camera_position"], self._avoid(state, obs), o.contact
+            )
+            for key, value in zip(("contact_point", "contact_flow", "standoff"), chosen, strict=True):
+                state[key] = torch.where((choosing | caught)[:, None], value, state[key])
+            seen = chosen[1].norm(dim=-1) > 0
+            phase = torch.where(choosing & seen, TRAVEL, phase)
+        state["phase"] = phase[:, None]
+
+    def _avoid(self, state: TensorDictBase, obs: TensorDictBase) -> Tensor:
+        """Points [E, N] near contact points that were tried in vain."""
+        distance = (obs["points"][:, :, None] - state["tried"][:, None]).norm(dim=-1)
+        used = torch.arange(TRIES, device=distance.device) < state["tries"]
+        return ((distance < self.options.retry_distance) & used[:, None]).any(-1)
+
+    def _path_velocity(self, state: TensorDictBase, obs: TensorDictBase, tip: Tensor) -> Tensor:
+        """Tip velocity [E, 3] (m/s) of the phases TRAVEL, APPROACH and RETREAT; 0 in the others."""
+        o, phase = self.options, state["phase"]
+        contact, standoff = state["contact_point"], state["standoff"]
+        offset = tip - contact
+        height = (offset * standoff).sum(-1, keepdim=True)
+        sideways = offset - height * standoff
+
+        approach_speed = torch.where(height > o.precontact, o.approach_speed, o.touch_speed)
+        approach = -approach_speed * standoff - 8.0 * sideways
+        retreat = o.approach_speed * standoff
+        travel = self._travel(obs, tip, contact, standoff)
+        velocity = torch.where(phase == TRAVEL, travel, torch.zeros_like(tip))
+        velocity = torch.where(phase == APPROACH, approach, velocity)
+        return torch.where(phase == RETREAT, retreat, velocity)
+
+    def _travel(self, obs: TensorDictBase, tip: Tensor, contact: Tensor, standoff: Tensor) -> Tensor:
+        """Velocity [E, 3] around the object's bounding sphere to where the approach line leaves it."""
+        o = self.options
+        valid = obs["valid"][..., None]
+        low = torch.where(valid, obs["points"], torch.inf).amin(1)
+        high = torch.where(valid, obs["points"], -torch.inf).amax(1)
+        centre = torch.nan_to_num(0.5 * (low + high), posinf=0.0, neginf=0.0)
+        radius = torch.where(valid, obs["points"] - centre[:, None], 0.0).norm(dim=-1).amax(-1, keepdim=True) + o.margin
+
+        # |contact + t standoff - centre| = radius, the larger root
+        from_centre = contact - centre
+        b = (from_centre * standoff).sum(-1, keepdim=True)
+        c = from_centre.square().sum(-1, keepdim=True) - radius.square()
+        t = (-b + (b * b - c).clamp_min(0).sqrt()).clamp_min(2 * o.precontact)
+        goal = contact + t * standoff
+
+        outward, distance = normalize(tip - centre), (tip - centre).norm(dim=-1, keepdim=True)
+        turn = alignment(outward, normalize(goal - centre))
+        tangent = torch.linalg.cross(normalize(turn), outward)
+        around = tangent + (radius - distance).clamp(-1, 1) * 4.0 * outward
+        straight = goal - tip
+        gap = straight.norm(dim=-1, keepdim=True)
+        far = (turn.norm(dim=-1, keepdim=True) > 0.35) & (distance > 0.5 * radius)
+        step = torch.where(far, normalize(around), normalize(straight))
+        speed = torch.where(far, torch.full_like(gap, o.travel_speed), (6.0 * gap).clamp(max=o.travel_speed))
+        return speed * step
+
+    def _flow_at(self, obs: TensorDictBase, flow: Tensor, tip: Tensor, last: Tensor) -> Tensor:
+        """Unit flow [E, 3] at the held point: mean over the nearest moving points; the last one where none is seen."""
+        norm = flow.norm(dim=-1)
+        moving = norm > 0.1 * norm.amax(-1, keepdim=True).clamp_min(1e-6)
+        distance = (obs["points"] - tip[:, None]).norm(dim=-1)
+        distance = torch.where(moving, distance, torch.inf)
+        nearest = distance.topk(min(self.options.neighbors, distance.shape[-1]), largest=False)
+        use = torch.isfinite(nearest.values)[..., None]
+        near_flow = flow.gather(1, nearest.indices[..., None].expand(-1, -1, 3))
+        mean = normalize(torch.where(use, near_flow, 0.0).sum(1))
+        return torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, last)
+
+    def _joint_velocities(
+        self, obs: TensorDictBase, tip: Tensor, hand: Tensor, velocity: Tensor, angular: Tensor
+    ) -> Tensor:
+        """Normalised joint velocities [E, 8] that move the tip at ``velocity`` and turn the hand at ``angular``.
+
+        The hand's spin about its own axis is free, so only the axis is controlled: damped least squares on the part
+        of the Euler Jacobian that turns it, which stays calm where the angles lock.
+        """
+        jacobian = euler_xyz_jacobian(obs["qpos"][..., 3:6])
+        across = torch.eye(3, dtype=hand.dtype, device=hand.device) - hand[..., :, None] * hand[..., None, :]
+        wanted = (across @ angular[..., None]).squeeze(-1)
+        wanted = wanted * (self.limits.angular / wanted.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
+        turning = across @ jacobian
+        gram = turning.mT @ turning + 1e-2 * torch.eye(3, dtype=hand.dtype, device=hand.device)
+        rates = torch.linalg.solve(gram, (turning.mT @ wanted[..., None])).squeeze(-1)
+        rates = rates.clamp(-self.limits.angular, self.limits.angular)
+        omega = (jacobian @ rates[..., None]).squeeze(-1)
+        lever = tip - obs["qpos"][..., :3]
+        linear = (velocity - torch.linalg.cross(omega, lever)) / self.limits.linear
+        linear = linear / linear.abs().amax(-1, keepdim=True).clamp_min(1.0)
+        fingers = torch.zeros(*rates.shape[:-1], ACTION_DIM - 6, dtype=rates.dtype, device=rates.device)
+        return torch.cat([linear, rates / self.limits.angular, fingers], dim=-1)
+
+
+def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:
+    """The flow policy fed with the ground-truth flow: the upper bound, and the oracle of DAgger."""
+    return FlowPolicy(("privileged", "flow"), limits, options)
+
+
+def artflownet_policy(
+    net: ArtFlowNet, limits: VelocityLimits, options: FlowPolicyOptions | None = None
+) -> TensorDictModule:
+    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy."""
+    return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))

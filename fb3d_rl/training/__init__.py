@@ -1,0 +1,1 @@
+"""The training loop of ArtFlowNet, checkpoints and the run log."""

@@ -1,0 +1,294 @@
+"""Fit a flow network to stored clouds: one readable loop.
+
+A run is a pure function of (model's first weights, rows, options): step k draws its rows and its rotations
+from the seed and k alone. So the state to resume from is the model, the optimizer and a counter, and a
+resumed run equals a straight one bit for bit on a CPU.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+
+from fb3d_rl.contract import UserError
+
+SCHEDULES = ("constant", "one_cycle")
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit.
+
+    Attributes:
+        steps: optimizer steps in all, those before a resumption included.
+        batch_size: clouds in a step (paper: 64).
+        lr: Adam's learning rate (paper: 1e-4); the peak if the schedule is not constant.
+        schedule: "constant", or "one_cycle": up from lr / 25 in the first tenth, then down a cosine to 0.
+        clip_norm: largest norm of the gradient; None leaves it alone.
+        rotate: turn every drawn cloud and its flow by a random angle about z.
+        seed: of the rows drawn and of the rotations.
+        log_every: steps from one log row to the next.
+        evaluate_every: steps from one evaluation to the next; None only at the end.
+        checkpoint_every: steps from one checkpoint to the next; None only at the end.
+        max_minutes: stop after this time. None by default: with it, two runs of one seed may differ.
+    """
+
+    steps: int
+    batch_size: int = 64
+    lr: float = 1e-4
+    schedule: str = "constant"
+    clip_norm: float | None = None
+    rotate: bool = True
+    seed: int = 0
+    log_every: int = 10
+    evaluate_every: int | None = None
+    checkpoint_every: int | None = None
+    max_minutes: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            UserError: a value is out of range.
+        """
+        if self.schedule not in SCHEDULES:
+            raise UserError(f"schedule={self.schedule} is unknown: choose one of {', '.join(SCHEDULES)}.")
+        for name in ("steps", "batch_size", "lr", "log_every", "evaluate_every", "checkpoint_every", "clip_norm"):
+            value = getattr(self, name)
+            if value is not None and value <= 0:
+                raise UserError(f"{name}={value} must be greater than 0.")
+
+
+def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """L2 loss (supplement, II.A): squared norm of the error [B, N, 3], mean over all valid [B, N] points of
+    the batch.
+
+    Static points count too: the network must learn what does not move.
+    """
+    squared = (predicted - target).square().sum(2).masked_fill(~valid, 0.0)
+    return squared.sum() / valid.sum().clamp(min=1)
+
+
+def learning_rate(step: int, options: FitOptions) -> float:
+    """The learning rate of step 0, 1, ... (one_cycle: after Smith and Topin 2018)."""
+    if options.schedule == "constant":
+        return options.lr
+    done, warm = (step + 1) / options.steps, 0.1
+    if done < warm:
+        return options.lr * (1 / 25 + (1 - 1 / 25) * done / warm)
+    return options.lr * 0.5 * (1 + math.cos(math.pi * (done - warm) / (1 - warm)))
+
+
+def _generator(seed: int, purpose: int, number: int) -> torch.Generator:
+    """A generator that depends on its arguments only. A multiplicative hash keeps neighbouring arguments
+    apart.
+    """
+    mixed = (seed * 0x9E3779B97F4A7C15 + purpose * 0xBF58476D1CE4E5B9 + number * 0x94D049BB133111EB) % 2**63
+    return torch.Generator().manual_seed(mixed)
+
+
+def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
+    """Which rows step number ``step`` reads [batch_size]: every pass over the rows is a new permutation."""
+    place = step * options.batch_size + torch.arange(options.batch_size)
+    passes = place // rows
+    chosen = torch.empty_like(place)
+    for number in passes.unique().tolist():
+        order = torch.randperm(rows, generator=_generator(options.seed, 1, number))
+        here = passes == number
+        chosen[here] = order[place[here] % rows]
+    return chosen
+
+
+def rotate_about_z(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Turn vectors [B, N, 3] about z by angle [B] (radians, counter-clockwise seen from above)."""
+    cos, sin = angle.cos()[:, None], angle.sin()[:, None]
+    x, y, z = vectors.unbind(2)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, z], 2)
+
+
+def tune_cpu() -> None:
+    """Two process-wide settings without which training on a CPU is up to three times slower.
+
+    Gradients shrink into denormal floats as training converges, which CPUs handle in microcode: flush them to
+    0. And glibc hands every large freed block back to the system, which then clears each page of the next
+    one: keep them.
+    """
+    torch.set_flush_denormal(True)
+    if sys.platform == "linux":
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc only
+        if mallopt is not None:
+            m_trim_threshold, m_mmap_max = -1, -4  # malloc.h
+            mallopt(m_mmap_max, 0)
+            mallopt(m_trim_threshold, 2**31 - 1)
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """Turn the first Ctrl-C into an event, so that a step is never cut in half; a second one interrupts at
+    once.
+    """
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+    previous = signal.getsignal(signal.SIGINT)
+
+    def ask(*_: object) -> None:
+        asked.set()
+        signal.signal(signal.SIGINT, previous)
+
+    signal.signal(signal.SIGINT, ask)
+    try:
+        yield asked
+    finally:
+        signal.signal(signal.SIGINT, previous)
+
+
+def fit(
+    model: nn.Module,
+    buffer: ReplayBuffer | TensorDictBase,
+    options: FitOptions,
+    *,
+    device: torch.device | str = "cpu",
+    evaluate: Callable[[], dict[str, float]] | None = None,
+    log: Callable[[dict[str, Any]], None] | None = None,
+    on_checkpoint: Callable[[dict[str, Any]], None] | None = None,
+    resume: dict[str, Any] | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Train a flow network.
+
+    Args:
+        model: called as model(points [B, N, 3], valid [B, N], part_mask [B, N]) -> flow [B, N, 3]; trained in
+            place.
+        buffer: rows with ("observation", "points" | "valid" | "part_mask") and ("privileged", "flow").
+        options: see FitOptions.
+        device: where to train; the model is moved there.
+        evaluate: measures the model, which is in evaluation mode meanwhile; its numbers go to the log.
+        log: receives rows {"step": ..., "train/loss": ..., ...}; keys that start with "time/" differ between
+            runs.
+        on_checkpoint: receives the state to resume from; also called at the end and on Ctrl-C.
+        resume: such a state.
+        progress: show a progress bar.
+
+    Returns:
+        The last state: {"step", "model", "optimizer", "loss_sum", "loss_count", "options"}.
+
+    Raises:
+        UserError: there are no rows, the state belongs to other options, the loss is not finite, or Ctrl-C
+        was pressed
+            (after the checkpoint).
+    """
+    tune_cpu()
+    rows = len(buffer)
+    if rows == 0:
+        raise UserError("There are no clouds to train on: generate flow samples first.")
+    model.to(device).train()
+    optimizer = torch.optim.Adam(model.parameters(), lr=options.lr)
+    step, loss_sum, loss_count = 0, 0.0, 0
+    if resume is not None:
+        _check_same_run(resume["options"], options)
+        model.load_state_dict(resume["model"])
+        optimizer.load_state_dict(resume["optimizer"])
+        step, loss_sum, loss_count = resume["step"], resume["loss_sum"], resume["loss_count"]
+
+    def state() -> dict[str, Any]:
+        return {
+            "step": step,
+            "model": model.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "loss_sum": loss_sum,
+            "loss_count": loss_count,
+            "options": asdict(options),
+        }
+
+    def update() -> float:
+        """One step: draw, turn, predict, descend; returns the loss."""
+        batch = buffer[batch_rows(step, rows, options)].to(device)
+        points, flow = batch["observation", "points"], batch["privileged", "flow"]
+        valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
+        if options.rotate:
+            angle = torch.rand(len(points), generator=_generator(options.seed, 2, step)).to(device) * (2 * math.pi)
+            points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(step, options)
+        optimizer.zero_grad()
+        loss = flow_loss(model(points, valid, part_mask), flow, valid)
+        loss.backward()
+        if options.clip_norm is not None:
+            nn.utils.clip_grad_norm_(model.parameters(), options.clip_norm)
+        optimizer.step()
+        return loss.item()
+
+    def due(every: int | None) -> bool:
+        return step == options.steps or (every is not None and step % every == 0)
+
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.0f} clouds/s  left"),
+        TimeRemainingColumn(),
+    )
+    started, first = time.perf_counter(), step
+    with Progress(*columns, disable=not progress) as bar, _deferred_interrupt() as interrupt:
+        task = bar.add_task("", total=options.steps, completed=step, loss=math.nan, rate=0.0)
+        while step < options.steps:
+            loss = update()
+            if not math.isfinite(loss):
+                raise UserError(f"The loss is {loss} after step {step + 1}: lower lr or set clip_norm.")
+            # Counters move after the work that they count.
+            step, loss_sum, loss_count = step + 1, loss_sum + loss, loss_count + 1
+            seconds = time.perf_counter() - started
+            rate = (step - first) * options.batch_size / seconds
+            bar.update(task, completed=step, loss=loss, rate=rate)
+            if due(options.log_every):
+                if log is not None:
+                    lr = learning_rate(step - 1, options)
+                    mean = loss_sum / loss_count
+                    log({"step": step, "train/loss": mean, "train/lr": lr, "time/seconds": seconds,
+                         "time/clouds_per_s": rate})  # fmt: skip
+                loss_sum, loss_count = 0.0, 0
+            if due(options.evaluate_every) and evaluate is not None:
+                model.eval()
+                numbers = evaluate()
+                model.train()
+                if log is not None:
+                    log({"step": step, **numbers})
+            late = options.max_minutes is not None and seconds > 60 * options.max_minutes
+            if (due(options.checkpoint_every) or late or interrupt.is_set()) and on_checkpoint is not None:
+                on_checkpoint(state())
+            if interrupt.is_set():
+                saved = "a checkpoint was saved, resume from it to go on" if on_checkpoint else "nothing was saved"
+                raise UserError(f"Stopped by Ctrl-C after step {step} of {options.steps}: {saved}.")
+            if late:
+                break
+    model.eval()
+    return state()
+
+
+def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:
+    """Refuse to continue a run under options that would have led elsewhere."""
+    decisive = ["batch_size", "lr", "schedule", "clip_norm", "rotate", "seed"]
+    if options.schedule != "constant":
+        decisive.append("steps")
+    for name in decisive:
+        if before[name] != getattr(options, name):
+            raise UserError(
+                f"The checkpoint was trained with {name}={before[name]}, not {getattr(options, name)}: "
+                f"resume with the same value or start a new run."
+            )

@@ -1,0 +1,70 @@
+"""A run's numbers: metrics.jsonl, one JSON object a line."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+FILE_NAME = "metrics.jsonl"
+TIME_PREFIX = "time/"
+"""Keys that start so hold timings and differ between two runs of one seed."""
+
+
+class RunLog:
+    """Append rows to metrics.jsonl in a run's folder; each is on disk when ``write`` returns.
+
+    Args:
+        out_dir: the run's folder; made if it is missing.
+        resume_step: keep the rows up to this step, drop later ones, which a resumed run writes again. None
+            starts an empty file.
+    """
+
+    def __init__(self, out_dir: Path | str, resume_step: int | None = None) -> None:
+        folder = Path(out_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path = folder / FILE_NAME
+        kept = []
+        if resume_step is not None and self.path.exists():
+            kept = [row for row in read_rows(self.path) if row.get("step", 0) <= resume_step]
+        temporary = self.path.with_suffix(".part")
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
+        os.replace(temporary, self.path)
+        self._file = self.path.open("a", encoding="utf-8")
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Append one row. JSON knows no nan or infinity: they become null."""
+        plain = {
+            key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()
+        }
+        self._file.write(json.dumps(plain) + "\n")
+        self._file.flush()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def __enter__(self) -> RunLog:
+        """Use as a context that closes the file."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+
+def read_rows(path: Path | str, times: bool = True) -> list[dict[str, Any]]:
+    """Rows of a metrics.jsonl; ``times=False`` leaves timings out. A last line cut short by a crash is
+    dropped.
+    """
+    text = Path(path).read_text(encoding="utf-8")
+    complete = text[: text.rfind("\n") + 1]
+    rows = [json.loads(line) for line in complete.splitlines()]
+    if times:
+        return rows
+    return [{key: value for key, value in row.items() if not key.startswith(TIME_PREFIX)} for row in rows]

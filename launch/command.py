@@ -1,0 +1,86 @@
+"""What the launch scripts share: compose the configuration, check it, and turn every user error into one sentence."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors come here as exceptions, in place of Hydra's own printout
+
+import hydra
+from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.contract import UserError
+
+CONF = str(Path(__file__).resolve().parents[1] / "conf")
+SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig]] = {"train": TrainConfig, "evaluate": EvaluateConfig}
+
+
+def main(name: str, task: Callable[[Any, Path], Any]) -> None:
+    """Run ``task(config, run folder)`` with conf/<name>.yaml and the overrides of the command line.
+
+    Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend.
+    """
+    ConfigStore.instance().store(name=f"{name}_schema", node=SCHEMAS[name])
+
+    @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
+    def job(raw: DictConfig) -> None:
+        out = Path(HydraConfig.get().runtime.output_dir)
+        with _one_sentence():
+            try:
+                cfg: Any = OmegaConf.to_object(raw)
+                validate(cfg)
+                OmegaConf.save(raw, out / "config.yaml")
+                task(cfg, out)
+            except UserError:
+                if not any(out.iterdir()):
+                    out.rmdir()  # Hydra made it; a run that never began leaves no folder
+                raise
+
+    with _one_sentence():
+        job()
+
+
+@contextmanager
+def _one_sentence() -> Iterator[None]:
+    """Turn an error that the user can mend into one sentence; inside the job, before Hydra adds words of its own."""
+    try:
+        yield
+    except UserError as error:
+        fail(str(error))
+    except (HydraException, OmegaConfBaseException) as error:
+        fail(_sentence(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        fail(f"{error.filename} cannot be written or read ({error.strerror}); choose another folder: hydra.run.dir=DIR")
+    except KeyboardInterrupt:
+        fail("interrupted; a training run goes on with resume=true hydra.run.dir=DIR")
+
+
+def fail(sentence: str) -> None:
+    """Say what is wrong on stderr and end with exit code 2."""
+    print(f"error: {' '.join(sentence.split())}", file=sys.stderr)
+    sys.exit(2)
+
+
+def _sentence(error: BaseException) -> str:
+    """Hydra's and OmegaConf's messages span lines, of which the first says what and a later one where."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    where = next((line.removeprefix("full_key: ") for line in lines if line.startswith("full_key: ")), "")
+    cause = error.__cause__
+    detail = str(cause).splitlines()[0] if cause is not None and str(cause) else ""
+    choices = ""
+    if "Available options" in str(error):
+        choices = "; choose from " + ", ".join(lines[2 : lines.index("Config search path:")])
+    text = " ".join(part for part in (lines[0] if lines else type(error).__name__, detail) if part) + choices
+    return f"{text} (key {where}; see conf/)" if where and where not in text else f"{text} (see conf/)"

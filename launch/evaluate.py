@@ -1,0 +1,19 @@
+"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet [checkpoint=PATH] [assets=...] [assets.split=...]``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from command import main
+
+
+def task(cfg: Any, out: Path) -> None:
+    """Evaluate the configured policy; the imports take seconds, so they come after the configuration's checks."""
+    from fb3d_rl.algos.artflownet import run_evaluation
+
+    run_evaluation(cfg, out)
+
+
+if __name__ == "__main__":
+    main("evaluate", task)

@@ -1,0 +1,19 @@
+"""Train: ``python launch/train.py [algo=artflownet] [assets=procedural|partnet_mobility assets.root=DIR] [seed=0] ...``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from command import main
+
+
+def task(cfg: Any, out: Path) -> None:
+    """Run the configured algorithm; its imports take seconds, so they come after the configuration's checks."""
+    from fb3d_rl.algos import artflownet
+
+    {"artflownet": artflownet.run}[cfg.algo.name](cfg, out)
+
+
+if __name__ == "__main__":
+    main("train", task)

@@ -1,0 +1,275 @@
+"""Procedural objects: reproducible bytes, sound meshes and joints, parts that move and touch nothing."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from fb3d_rl.assets.procedural import FAMILIES, generate, sample
+from fb3d_rl.contract import UserError
+
+PER_FAMILY = 6
+SEED = 3
+GAP = 0.002  # m, kept between links at every joint position
+
+
+@dataclass
+class Link:
+    """A link as its files have it; meshes lie in the object's frame (y up, front +z) in the closed state."""
+
+    joint: str
+    semantic: str
+    axis: np.ndarray
+    origin: np.ndarray
+    limits: tuple[float, float]
+    meshes: list[trimesh.Trimesh]
+
+    def moved(self, points: np.ndarray, q: float) -> np.ndarray:
+        """Points [P, 3] of the link in the object's frame at joint position q."""
+        if self.joint == "prismatic":
+            return points + q * self.axis
+        return Rotation.from_rotvec(q * self.axis).apply(points - self.origin) + self.origin
+
+
+def attribute(element: ET.Element, path: str, name: str) -> str:
+    found = element.find(path)
+    assert found is not None
+    return found.attrib[name]
+
+
+def vector(text: str) -> np.ndarray:
+    return np.array(text.split(), dtype=float)
+
+
+def read(folder: Path) -> tuple[Link, list[Link]]:
+    """Body and movable links, by a reader that knows nothing of the writer."""
+    root = ET.parse(folder / "mobility.urdf").getroot()
+    semantics = dict(line.split(" ", 1) for line in (folder / "semantics.txt").read_text().splitlines())
+    links = {link.attrib["name"]: link for link in root.iter("link")}
+    assert len(links["base"]) == 0
+    assert set(semantics) == set(links) - {"base"}
+    bodies, movable = [], []
+    for joint in root.iter("joint"):
+        name = attribute(joint, "child", "link")
+        origin = vector(attribute(joint, "origin", "xyz"))
+        meshes = []
+        for visual, collision in zip(links[name].iter("visual"), links[name].iter("collision"), strict=True):
+            filename = attribute(visual, "geometry/mesh", "filename")
+            assert attribute(collision, "geometry/mesh", "filename") == filename
+            offset = vector(attribute(visual, "origin", "xyz"))
+            np.testing.assert_array_equal(vector(attribute(collision, "origin", "xyz")), offset)
+            mesh = trimesh.load_mesh(folder / filename, process=False)
+            mesh.vertices = np.asarray(mesh.vertices) + offset + origin
+            meshes.append(mesh)
+        if joint.attrib["type"] == "fixed":
+            assert attribute(joint, "parent", "link") == "base"
+            assert attribute(joint, "origin", "rpy") == "1.570796326794897 0 -1.570796326794897"
+            bodies.append(Link("fixed", semantics[name], np.zeros(3), origin, (0, 0), meshes))
+        else:
+            axis = vector(attribute(joint, "axis", "xyz"))
+            limits = float(attribute(joint, "limit", "lower")), float(attribute(joint, "limit", "upper"))
+            movable.append(Link(joint.attrib["type"], semantics[name], axis, origin, limits, meshes))
+    (body,) = bodies
+    return body, movable
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("procedural")
+    generate(out, list(FAMILIES), PER_FAMILY, SEED)
+    return out
+
+
+@pytest.fixture(scope="module", params=list(FAMILIES))
+def objects(folder: Path, request: pytest.FixtureRequest) -> list[tuple[Path, Link, list[Link]]]:
+    paths = sorted(folder.glob(f"proc-{request.param}-*"))
+    assert len(paths) == PER_FAMILY
+    return [(path, *read(path)) for path in paths]
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_same_seed_same_bytes(tmp_path: Path) -> None:
+    """Neither the order of the categories nor what was generated before plays a part."""
+    ids = generate(tmp_path / "a", list(FAMILIES), 2, 11)
+    assert len(set(ids)) == 2 * len(FAMILIES)
+    assert set(ids) == set(generate(tmp_path / "b", list(reversed(FAMILIES)), 2, 11))
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+def test_index_seed_and_category_each_change_the_object(tmp_path: Path) -> None:
+    first = sample("StorageFurniture", 0, 0).bounds()
+    assert not np.allclose(first, sample("StorageFurniture", 0, 1).bounds())
+    assert not np.allclose(first, sample("StorageFurniture", 1, 0).bounds())
+    for category in FAMILIES:
+        shapes = {tuple(np.round(sample(category, 0, i).bounds().ravel(), 4)) for i in range(20)}
+        assert len(shapes) == 20, category
+
+
+def test_replaces_an_object_and_leaves_nothing_else(tmp_path: Path) -> None:
+    (name,) = generate(tmp_path, ["Box"], 1, 0)
+    expected = tree(tmp_path)
+    (tmp_path / name / "stale.txt").write_text("left by an older run")
+    assert generate(tmp_path, ["Box"], 1, 0) == [name]
+    assert tree(tmp_path) == expected
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_failed_object_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("fb3d_rl.assets.procedural.spec._obj", fail)
+    with pytest.raises(OSError, match="disk full"):
+        generate(tmp_path, ["Box"], 1, 0)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [((["Teapot"], 1, 0), "Teapot"), ((["Box"], 0, 0), "at least 1"), ((["Box"], 1, -1), "seed")],
+)
+def test_user_errors(tmp_path: Path, arguments: tuple[list[str], int, int], message: str) -> None:
+    with pytest.raises(UserError, match=message):
+        generate(tmp_path, *arguments)
+
+
+def test_files(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, body, movable in objects:
+        assert json.loads((path / "meta.json").read_text())["model_cat"] == path.name.split("-")[1]
+        box = json.loads((path / "bounding_box.json").read_text())
+        points = np.concatenate([mesh.vertices for link in (body, *movable) for mesh in link.meshes])
+        np.testing.assert_allclose([box["min"], box["max"]], [points.min(0), points.max(0)], atol=2e-6)
+        np.testing.assert_allclose(np.add(box["min"], box["max"]), 0, atol=2e-6)
+        assert np.linalg.norm(np.subtract(box["max"], box["min"])) == pytest.approx(2, abs=1e-4)
+        table = json.loads((path / "mobility_v2.json").read_text())
+        assert len(table) == len(movable) + 1
+        for entry, link in zip(table[:-1], movable, strict=True):
+            degrees = np.degrees(link.limits[1]) if link.joint == "revolute" else link.limits[1]
+            assert entry["jointData"]["limit"]["b"] == pytest.approx(degrees, abs=1e-4)
+            np.testing.assert_allclose(entry["jointData"]["axis"]["direction"], link.axis, atol=1e-6)
+            np.testing.assert_allclose(entry["jointData"]["axis"]["origin"], link.origin, atol=1e-6)
+        assert table[-1]["parent"] == -1
+    assert len({tuple(np.round(body.meshes[0].vertices.ravel(), 3)) for _, body, _ in objects}) == len(
+        objects
+    )
+
+
+def test_joints_open_outwards(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, _, movable in objects:
+        assert 1 <= len(movable) <= 6
+        for link in movable:
+            low, high = link.limits
+            kind, name = link.semantic.split(" ")
+            assert (kind, link.joint) in {("hinge", "revolute"), ("slider", "prismatic")}
+            assert low == 0
+            assert (1.2 <= high <= 2.2) if kind == "hinge" else (0.15 <= high <= 1.0), (path.name, name)
+            assert np.linalg.norm(link.axis) == pytest.approx(1)
+            points = np.concatenate([mesh.vertices for mesh in link.meshes])
+            way = (link.moved(points, 0.2 * high) - points).mean(0)
+            upwards = "lid" in name or name in ("screen", "handle")
+            if name == "translation_window":  # away from its own jamb
+                assert way[0] * points[:, 0].mean() < 0, path.name
+            else:
+                assert way[1 if upwards else 2] > 0.02, (path.name, name)
+
+
+def test_pieces_are_convex_and_watertight(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, body, movable in objects:
+        for link in (body, *movable):
+            for mesh in link.meshes:
+                assert mesh.is_watertight, path
+                assert mesh.is_winding_consistent, path
+                assert mesh.volume > 1e-7, path
+                height = mesh.vertices @ mesh.face_normals.T - (mesh.triangles[:, 0] * mesh.face_normals).sum(
+                    1
+                )
+                assert height.max() < 1e-4, path  # every corner lies behind every face
+
+
+def test_bodies_are_hollow(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, body, movable in objects:
+        if movable[0].semantic.endswith("screen"):
+            continue
+        points = np.concatenate([mesh.vertices for mesh in body.meshes])
+        assert sum(mesh.volume for mesh in body.meshes) < 0.65 * np.prod(np.ptp(points, axis=0)), path
+
+
+def directions(vectors: np.ndarray) -> np.ndarray:
+    """The distinct lines [D, 3] among vectors [K, 3], as unit vectors."""
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    sign = np.sign(np.where(np.abs(unit) > 1e-3, unit, 0) @ [100, 10, 1])
+    return np.unique(np.round(unit * np.where(sign == 0, 1, sign)[:, None], 4), axis=0)
+
+
+def corners_and_directions(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    edges = mesh.face_adjacency_edges[mesh.face_adjacency_angles > 1e-3]
+    along = mesh.vertices[edges[:, 1]] - mesh.vertices[edges[:, 0]]
+    return np.asarray(mesh.vertices), directions(mesh.face_normals), directions(along)
+
+
+def separation(a: tuple[np.ndarray, ...], b: tuple[np.ndarray, ...]) -> float:
+    """Widest gap (m) between two convex pieces along a separating-axis candidate; negative on overlap."""
+    crosses = np.cross(a[2][:, None], b[2][None]).reshape(-1, 3)
+    length = np.linalg.norm(crosses, axis=1)
+    axes = np.concatenate([a[1], b[1], crosses[length > 1e-3] / length[length > 1e-3, None]])
+    pa, pb = a[0] @ axes.T, b[0] @ axes.T
+    return float(np.maximum(pa.min(0) - pb.max(0), pb.min(0) - pa.max(0)).max())
+
+
+def test_separating_axes() -> None:
+    cube = trimesh.creation.box((1, 1, 1))
+    turned = cube.copy()
+    for shift, expected in ((1.3, 0.8 - 0.5**0.5), (1.1, 0.6 - 0.5**0.5)):
+        turned.vertices = Rotation.from_euler("z", 45, degrees=True).apply(cube.vertices) + [shift, 0, 0]
+        found = separation(corners_and_directions(cube), corners_and_directions(turned))
+        assert found == pytest.approx(expected, abs=1e-3)
+
+
+def test_parts_touch_nothing_while_they_move(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, body, movable in objects:
+        static = {
+            id(link): [corners_and_directions(mesh) for mesh in link.meshes] for link in (body, *movable)
+        }
+        for link in movable:
+            others = [piece for other in (body, *movable) if other is not link for piece in static[id(other)]]
+            low = np.stack([piece[0].min(0) for piece in others])
+            high = np.stack([piece[0].max(0) for piece in others])
+            for share in (0, 0.02, 0.05, 0.25, 0.5, 0.75, 1):
+                q = share * link.limits[1]
+                turn = (
+                    Rotation.from_rotvec(q * link.axis) if link.joint == "revolute" else Rotation.identity()
+                )
+                for points, normals, edges in static[id(link)]:
+                    moved = (link.moved(points, q), turn.apply(normals), turn.apply(edges))
+                    near = ((moved[0].min(0) < high + GAP) & (moved[0].max(0) > low - GAP)).all(1)
+                    for k in np.flatnonzero(near):
+                        assert separation(moved, others[k]) > GAP, (path.name, link.semantic, share)
+
+
+def test_simulator_loads_them(folder: Path) -> None:
+    sapien = pytest.importorskip("sapien")
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+    for category in FAMILIES:
+        path = folder / f"proc-{category}-{SEED}-0000"
+        _, movable = read(path)
+        (builder,), *_ = scene.create_urdf_loader().parse(str(path / "mobility.urdf"))
+        for link in builder.link_builders:
+            link.visual_records.clear()  # these would need a renderer
+        articulation = builder.build()
+        limits = np.array([joint.limits[0] for joint in articulation.active_joints])
+        np.testing.assert_allclose(limits, [link.limits for link in movable], atol=1e-5)
+        assert len(articulation.links) == len(movable) + 2

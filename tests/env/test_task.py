@@ -1,0 +1,229 @@
+"""The task: simulator and formulas agree, episodes repeat bit for bit, states can be restored."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import sapien
+import torch
+from tensordict import TensorDict
+
+from fb3d_rl import contract
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.camera.views import View
+from fb3d_rl.contract import UserError
+from fb3d_rl.env.options import EnvOptions, Trial, default_trial
+from fb3d_rl.env.task import OpenArticulatedEnv
+
+from .conftest import POINTS, links_called, place_before, start, step_until, velocity
+
+
+def middle(obj: ArticulatedObject, seed: int) -> torch.Tensor:
+    """A random joint state [J] within the limits."""
+    limits = np.nan_to_num(obj.limits, posinf=1.0, neginf=-1.0)
+    return torch.as_tensor(np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1]))
+
+
+def set_joints(env: OpenArticulatedEnv, state: torch.Tensor) -> None:
+    qpos = torch.zeros(1, len(state))
+    qpos[:, env._order] = state.float()
+    env.articulation.set_qpos(qpos)
+
+
+def poses(env: OpenArticulatedEnv) -> np.ndarray:
+    return np.stack([link.entity_pose.to_transformation_matrix() for link in env._links])
+
+
+def check_kinematics(env: OpenArticulatedEnv, obj: ArticulatedObject) -> None:
+    env.reset(options={"trial": default_trial(obj)})
+    for seed in range(3):
+        state = middle(obj, seed)
+        set_joints(env, state)
+        expected = (env.T_world_base @ env.tree.forward(state)).numpy()
+        np.testing.assert_allclose(poses(env), expected, atol=1e-4)
+
+
+def test_simulator_has_the_poses_of_the_kinematic_tree(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    for obj in objects.values():
+        check_kinematics(env, obj)
+
+
+def test_real_objects_have_the_poses_of_the_kinematic_tree(real_objects: list[ArticulatedObject]) -> None:
+    env = OpenArticulatedEnv(real_objects, EnvOptions(points=POINTS))
+    for obj in real_objects:
+        check_kinematics(env, obj)
+
+
+def test_object_equals_the_one_that_maniskill_reads(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    obj = objects["StorageFurniture"]
+    env.reset(options={"trial": default_trial(obj)})
+    loader = env.scene.create_urdf_loader()
+    loader.name = "reference"
+    builder = loader.parse(str(obj.urdf))["articulation_builders"][0]
+    for link in builder.link_builders:
+        link.visual_records.clear()
+    builder.initial_pose = sapien.Pose(env.T_world_base.numpy())
+    reference = builder.build(fix_root_link=True)
+    state = middle(obj, 0)
+    set_joints(env, state)
+    by_link = dict(zip((obj.links[i].name for i in obj.movable), state.tolist(), strict=True))
+    reference.set_qpos(torch.tensor([[by_link[joint.child_link.name] for joint in reference.active_joints]]))
+    for link, pose in zip(obj.links, poses(env), strict=True):
+        other = reference.links_map[link.name]._objs[0]
+        np.testing.assert_allclose(other.entity_pose.to_transformation_matrix(), pose, atol=1e-4)
+        assert other.mass == pytest.approx(env.articulation.links_map[link.name]._objs[0].mass, rel=0.02)
+
+
+def test_observation_keeps_the_contract(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["StorageFurniture"]
+    obs = start(env, obj, links_called(obj, "rotation_door")[0])
+    td = TensorDict(obs, batch_size=[1])
+    contract.check(td, "observation")
+    contract.check(td, "privileged")
+    contract.check(TensorDict(env.evaluate(), batch_size=[1]).select("normalized_distance", "contact"), "metrics")
+    assert float(env.evaluate()["normalized_distance"]) == 1.0
+
+
+def test_flow_is_the_simulators_own_motion(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    for category, semantic in (("StorageFurniture", "rotation_door"), ("Table", "drawer"), ("Laptop", "screen")):
+        obj = objects[category]
+        obs = start(env, obj, links_called(obj, semantic)[0])
+        state = env.joint_positions()[0].double()
+        before = poses(env)
+        state[env.target] += 0.002 * np.sign(env.goal - env.trial.start[env.target])
+        set_joints(env, state)
+        motion = poses(env) @ np.linalg.inv(before)
+        points = obs["observation"]["points"][0].numpy()
+        link = obs["privileged"]["link"][0].numpy()
+        moved = np.einsum("nij,nj->ni", motion[link][:, :3, :3], points) + motion[link][:, :3, 3] - points
+        moved[link < 0] = 0
+        expected = moved / np.linalg.norm(moved, axis=-1).max()
+        flow = obs["privileged"]["flow"][0].numpy()
+        np.testing.assert_allclose(flow, expected, atol=0.01)
+        part = obs["observation"]["part_mask"][0].numpy()
+        assert part.any() and not flow[~part].any()
+
+
+def test_the_gripper_hides_points_and_is_none(objects: dict[str, ArticulatedObject]) -> None:
+    env = OpenArticulatedEnv([objects["Table"]], EnvOptions(points=96 * 96))
+    obs, _ = env.reset()
+    eye = obs["observation"]["camera_position"][0]
+    seen = int(obs["observation"]["valid"].sum())
+    # A hand close to the lens covers the object.
+    middle_of_view = obs["observation"]["points"][0].mean(0)
+    hand = torch.zeros(1, 8)
+    hand[0, :3] = eye + 0.1 * (middle_of_view - eye)
+    env.agent.robot.set_qpos(hand)
+    covered = env.get_obs()["observation"]
+    assert int(covered["valid"].sum()) < seen
+    cloud = covered["points"][0][covered["valid"][0]]
+    assert not len(cloud) or float((cloud - hand[0, :3]).norm(dim=-1).min()) > 0.2
+
+
+def episode(env: OpenArticulatedEnv, trial: Trial) -> list[bytes]:
+    """Push, touch and pull for some steps; every bit of every observation, and of the metrics."""
+    obs, info = env.reset(options={"trial": trial})
+    place_before(env, trial.link, obs)
+    record = []
+    for action in [velocity(x=0.3)] * 12 + [velocity(x=-0.3, y=0.1)] * 12:
+        obs, reward, *_, info = env.step(action)
+        tensors = [value for group in obs.values() for value in group.values()]
+        tensors += [reward, info["normalized_distance"], info["contact"]]
+        record.append(b"".join(tensor.numpy().tobytes() for tensor in tensors))
+    return record
+
+
+def test_a_trial_repeats_bit_for_bit(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    cabinet, table = objects["StorageFurniture"], objects["Table"]
+    a = default_trial(cabinet, links_called(cabinet, "drawer")[0], View(20.0, 40.0), seed=3)
+    b = default_trial(table)
+    first = episode(env, a)
+    episode(env, b)
+    assert episode(env, a) == first
+    fresh = OpenArticulatedEnv([cabinet], EnvOptions(points=POINTS))
+    assert episode(fresh, a) == first
+    assert episode(env, dataclasses.replace(a, seed=4)) != first
+
+
+def test_state_can_be_restored(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    drawer = links_called(objects["Table"], "drawer")[0]
+    place_before(env, drawer, start(env, objects["Table"], drawer))
+    step_until(env, velocity(x=0.3), lambda: env.suction.attached)
+    for _ in range(5):
+        env.step(velocity(x=-0.2))
+    state = env.get_state_dict()
+    outcomes = []
+    for _ in range(2):
+        for _ in range(5):
+            obs, *_, info = env.step(velocity(x=-0.3))
+        outcomes.append((obs["observation"]["qpos"], info["normalized_distance"], env.elapsed_steps.clone()))
+        env.suction.release()
+        env.step(velocity(x=-0.5))
+        env.set_state_dict(state)
+        restored = env.get_state_dict()
+        for key in ("suction", "episode"):
+            torch.testing.assert_close(restored[key], state[key])
+        for name, value in state["articulations"].items():
+            torch.testing.assert_close(restored["articulations"][name], value, atol=1e-5, rtol=0)
+    for first, second in zip(*outcomes, strict=True):
+        torch.testing.assert_close(first, second, atol=2e-3, rtol=0)
+
+
+def test_an_episode_is_truncated_at_the_horizon(objects: dict[str, ArticulatedObject]) -> None:
+    env = OpenArticulatedEnv([objects["Table"]], EnvOptions(points=POINTS, horizon=4))
+    env.reset()
+    flags = [bool(env.step(velocity())[3]) for _ in range(4)]
+    assert flags == [False, False, False, True]
+
+
+def test_nothing_is_rendered(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    start(env, objects["Table"], objects["Table"].movable[0])
+    assert not env.scene.can_render()
+    for entity in env.scene.sub_scenes[0].entities:
+        assert not any(isinstance(part, sapien.render.RenderBodyComponent) for part in entity.components)
+
+
+def test_parts_do_not_coast_on(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["Table"]
+    start(env, obj, links_called(obj, "drawer")[0])
+    speed = torch.zeros(1, len(obj.movable))
+    speed[:, env._order[env.target]] = 0.3
+    env.articulation.set_qvel(speed)
+    for _ in range(20):
+        env.step(velocity())
+    assert 0.02 < float(env.joint_positions()[0, env.target]) - env.trial.start[env.target] < 0.1
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"object": "nobody"}, "nobody"),
+        ({"link": 0}, "movable"),
+        ({"start": (0.0,)}, "start"),
+    ],
+)
+def test_wrong_trials_are_refused(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject], change: dict, words: str
+) -> None:
+    trial = dataclasses.replace(default_trial(objects["Table"]), **change)
+    with pytest.raises(UserError, match=words):
+        env.reset(options={"trial": trial})
+
+
+def test_a_trial_that_is_won_from_the_start_is_refused(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    obj = objects["Oven"]
+    with pytest.raises(UserError, match="fully open"):
+        env.reset(options={"trial": dataclasses.replace(default_trial(obj), start=tuple(obj.limits[:, 1]))})
+
+
+def test_an_environment_without_objects_is_refused() -> None:
+    with pytest.raises(UserError, match="object"):
+        OpenArticulatedEnv([])

@@ -1,0 +1,248 @@
+from __future__ import annotations
+
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation.report import write_comparison, write_report
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.tables import summary
+
+ROOT = Path(__file__).parents[2]
+EVIL = "<script>alert(1)</script>"
+
+
+def fill(run: Path) -> list[TrialRow]:
+    """A small run folder with every file; one object, category and error try to inject a script."""
+    run.mkdir(parents=True)
+    rows = [
+        TrialRow(
+            trial=i,
+            policy=policy,
+            object=EVIL if i == 0 else f"object-{i}",
+            category=EVIL if i == 0 else "Oven",
+            split="test",
+            link=f"link_{i}",
+            semantic="door",
+            joint_type="revolute",
+            seed=1000 + i,
+            status="error" if i == 1 else "ok",
+            error=EVIL if i == 1 else "",
+            contact=i > 2,
+            success=i > 4,
+            normalized_distance=0.05 if i > 4 else 1.0,
+            failure="" if i > 4 else f"reason {policy} {i}",
+        )
+        for i in range(7)
+        for policy in ("expert", "artflownet")
+    ]
+    flow = [FlowRow(row.object, row.category, row.split, row.link, 0.8, 0.2, 0.1) for row in rows]
+    write_trials(run / "rows.csv", rows)
+    write_flow(run / "flow_rows.csv", flow)
+    numbers = summary(rows, flow, {"seed": 5, "git_revision": "cafe01", "command": f"train {EVIL}"})
+    (run / "summary.json").write_text(json.dumps(numbers))
+    (run / "config.yaml").write_text(f"name: {EVIL}\n")
+    log = [
+        {"step": i, "train/loss": 1 / (i + 1), "val/cosine": float("nan") if i == 3 else 0.5}
+        for i in range(9)
+    ]
+    (run / "metrics.jsonl").write_text(
+        "".join(json.dumps(entry) + "\n" for entry in log) + '{"step": 9, "tra'
+    )
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(3, 50, 3)).astype(np.float32)
+    valid = np.ones((3, 50), dtype=bool)
+    valid[1, 40:] = False
+    valid[2] = False
+    predicted = points.copy()
+    predicted[0, 0] = np.nan
+    np.savez(
+        run / "clouds.npz",
+        points=points,
+        valid=valid,
+        part_mask=points[..., 0] > 0,
+        flow_true=points * (points[..., :1] > 0),
+        flow_predicted=predicted,
+        title=np.array(["first", EVIL, "nothing visible"]),
+    )
+    return rows
+
+
+class Page(HTMLParser):
+    """Collects what a browser would see."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.scripts: list[str] = []
+        self.feed(path.read_text("utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag == "script":
+            self.scripts.append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.cdata_elem == "script":
+            self.scripts[-1] += data
+        elif self.cdata_elem is None:
+            self.text.append(data)
+
+    def json_of(self, key: str, value: str) -> dict[str, object]:
+        attributes = [attrs for tag, attrs in self.tags if tag == "script"]
+        found: dict[str, object] = json.loads(
+            self.scripts[next(i for i, attrs in enumerate(attributes) if attrs.get(key) == value)]
+        )
+        return found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("runs") / "first"
+    fill(run)
+    write_report(run)
+    return run
+
+
+@pytest.fixture(scope="module")
+def page(run: Path) -> Page:
+    return Page(run / "report.html")
+
+
+def test_every_failed_trial_is_listed(page: Page) -> None:
+    shown = " ".join(page.text)
+    for i in range(7):
+        for policy in ("expert", "artflownet"):
+            assert (f"reason {policy} {i}" in shown) == (i <= 4)
+
+
+def test_strings_from_outside_are_shown_not_run(page: Page) -> None:
+    scripts = [script for script in page.scripts if script.strip() == "alert(1)"]
+    assert not scripts
+    # Facts, category table, object, error and configuration all show the string literally.
+    assert sum(EVIL in piece for piece in page.text) >= 5
+    figure = json.dumps(page.json_of("data-figure", "success"))
+    assert "&lt;script&gt;" in figure and "<script>" not in figure
+
+
+def test_nothing_is_loaded_from_elsewhere(run: Path, page: Page) -> None:
+    for tag, attrs in page.tags:
+        assert not {"src", "href", "data", "action"} & set(attrs), (tag, attrs)
+        assert tag not in ("link", "iframe", "img", "base", "object", "embed")
+    policy = next(a["content"] for t, a in page.tags if t == "meta" and "http-equiv" in a)
+    assert policy is not None and "default-src 'none'" in policy and "http" not in policy
+    css = re.search(r"<style>(.*?)</style>", (run / "report.html").read_text("utf-8"), re.DOTALL)
+    assert css is not None and "url(" not in css[1] and "@import" not in css[1]
+    assert sum(len(script) > 1_000_000 for script in page.scripts) == 1  # plotly.js, once
+
+
+def test_numbers_and_facts_are_on_the_page(page: Page) -> None:
+    shown = " ".join(page.text)
+    for word in ("cafe01", "0.80", "29 %", "artflownet", "expert", "class mean", "instance mean"):
+        assert word in shown, word
+
+
+def test_the_viewer_holds_the_visible_clouds(page: Page) -> None:
+    clouds = page.json_of("id", "clouds")["clouds"]
+    assert isinstance(clouds, list)
+    assert [cloud["title"] for cloud in clouds] == ["first", EVIL]
+    assert [len(c["rest"][0]) + len(c["part"][0]) for c in clouds] == [50, 40]
+    for cloud in clouds:
+        for arrow in cloud["true"]["vector"]:
+            assert np.linalg.norm(arrow) > 0
+
+
+def test_missing_files_leave_no_empty_sections(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    fill(run)
+    titles = {
+        "rows.csv": "Failed trials",
+        "clouds.npz": "True and predicted flow",
+        "metrics.jsonl": "Training",
+        "config.yaml": "Configuration",
+        "summary.json": None,
+        "flow_rows.csv": "Results",
+    }
+    names = list(titles)
+    for k, name in enumerate(names[:-1]):
+        (run / name).unlink()
+        html = write_report(run).read_text("utf-8")
+        for gone in names[: k + 1]:
+            assert f"<h2>{titles[gone]}</h2>" not in html
+        for kept in names[k + 1 :]:
+            assert titles[kept] is None or f"<h2>{titles[kept]}</h2>" in html
+
+
+def test_without_a_summary_it_is_computed_from_the_rows(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "run"
+    rows = fill(other)
+    (other / "summary.json").unlink()
+    numbers = " ".join(Page(write_report(other)).text)
+    assert f"{len(rows) // 2} trials on 7 objects, 1 crashed" in numbers
+
+
+def test_writing_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
+    assert write_report(run, tmp_path / "again.html").read_bytes() == (run / "report.html").read_bytes()
+
+
+def test_comparison_names_every_run_and_policy(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "a" / "first"
+    fill(other)
+    compared = Page(write_comparison([run, other], tmp_path / "out" / "comparison.html"))
+    shown = " ".join(compared.text)
+    for label in (f"{run.parent.name}/first", "a/first"):
+        assert label in shown
+    assert shown.count("artflownet") >= 2
+    figure = json.dumps(compared.json_of("data-figure", "success_rate"))
+    assert "a/first \\u00b7 artflownet" in figure
+    with pytest.raises(UserError, match="twice"):
+        write_comparison([run, run], tmp_path / "comparison.html")
+
+
+def test_command_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main = runpy.run_path(str(ROOT / "launch" / "report.py"))["main"]
+    assert main([str(run), "--out", str(tmp_path / "report.html")]) == 0
+    assert (tmp_path / "report.html").read_bytes() == (run / "report.html").read_bytes()
+    assert "instance mean" in capsys.readouterr().out
+    fill(tmp_path / "second")
+    assert main([str(run), str(tmp_path / "second"), "--out", str(tmp_path / "both.html")]) == 0
+    assert (tmp_path / "both.html").is_file()
+
+
+def test_bad_input_ends_with_one_sentence_and_exit_code_2(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, ROOT / "launch" / "report.py", tmp_path],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and "not a run folder" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("summary.json", "{"),
+        ("summary.json", "[]"),
+        ("metrics.jsonl", "nonsense\n"),
+        ("clouds.npz", "nonsense"),
+        ("rows.csv", "nonsense"),
+    ],
+)
+def test_unreadable_files_are_named(tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(UserError, match=name):
+        write_report(tmp_path)

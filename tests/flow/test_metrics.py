@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
+
+
+def test_hand_computed_cloud() -> None:
+    target = torch.tensor([[[1.0, 0, 0], [0, 2, 0], [0, 0, 0], [3, 0, 0]]])
+    predicted = torch.tensor([[[0.0, 1, 0], [0, 0, 0], [5, 5, 5], [9, 9, 9]]])
+    valid = torch.tensor([[True, True, True, False]])
+    metrics = flow_metrics(predicted, target, valid)
+    # Two moving points: one turned by 90 degrees, one predicted to stand still.
+    assert metrics["rmse"].item() == pytest.approx((math.sqrt(2) + 2) / 2)
+    assert metrics["cosine"].item() == 0.0
+    assert metrics["magnitude_error"].item() == pytest.approx((0 + 2) / 2)
+
+
+def test_cosine_ignores_length_and_sees_sign() -> None:
+    target = torch.tensor([[[1.0, 2, 2]], [[1.0, 2, 2]], [[1e-3, 0, 0]]])
+    predicted = torch.tensor([[[0.1, 0.2, 0.2]], [[-2.0, -4, -4]], [[1.0, 1, 0]]])
+    cosine = flow_metrics(predicted, target, torch.ones(3, 1, dtype=torch.bool))["cosine"]
+    torch.testing.assert_close(cosine, torch.tensor([1.0, -1.0, math.sqrt(0.5)]))
+
+
+def test_cloud_without_motion_is_nan_and_left_out_of_the_mean() -> None:
+    target = torch.zeros(2, 5, 3)
+    target[1, 0, 0] = 1.0
+    predicted = torch.zeros(2, 5, 3)
+    predicted[1, 0, 0] = 0.5
+    metrics = flow_metrics(predicted, target, torch.ones(2, 5, dtype=torch.bool))
+    assert all(torch.isnan(values[0]) for values in metrics.values())
+    assert mean_metrics(metrics) == pytest.approx({"rmse": 0.5, "cosine": 1.0, "magnitude_error": 0.5})

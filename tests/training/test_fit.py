@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import io
+import math
+import os
+import signal
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import LazyMemmapStorage, ReplayBuffer
+
+from fb3d_rl.contract import UserError
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.training.fit import FitOptions, batch_rows, fit, flow_loss, learning_rate, rotate_about_z
+
+
+def make_rows(rows: int = 6, points: int = 64) -> TensorDict:
+    """Clouds of which one half slides along the axis that its mask marks."""
+    generator = torch.Generator().manual_seed(5)
+    cloud = torch.rand(rows, points, 3, generator=generator)
+    mask = cloud[..., 2] > 0.5
+    flow = torch.zeros(rows, points, 3)
+    flow[..., 0] = mask.float()
+    valid = torch.rand(rows, points, generator=generator) < 0.95
+    flow[~valid] = 0.0
+    return TensorDict(
+        {
+            "observation": {"points": cloud, "valid": valid, "part_mask": mask & valid},
+            "privileged": {"flow": flow},
+        },
+        batch_size=[rows],
+    )
+
+
+def make_net(seed: int = 0) -> ArtFlowNet:
+    return ArtFlowNet(neighbors=16, generator=torch.Generator().manual_seed(seed))
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    return a == b
+
+
+def test_two_runs_have_the_same_bits() -> None:
+    """Ten steps on the threads there are, from a memory-mapped buffer."""
+    buffer = ReplayBuffer(storage=LazyMemmapStorage(6), batch_size=4)
+    buffer.extend(make_rows())
+    runs = [fit(make_net(), buffer, FitOptions(steps=10, batch_size=4), progress=False) for _ in range(2)]
+    assert same(runs[0]["model"], runs[1]["model"])
+    other = fit(make_net(), buffer, FitOptions(steps=10, batch_size=4, seed=1), progress=False)
+    assert not same(runs[0]["model"], other["model"])
+
+
+def test_resumed_run_equals_straight_run() -> None:
+    options = FitOptions(steps=7, batch_size=4, lr=1e-3, schedule="one_cycle", log_every=2, checkpoint_every=3)
+    states: list[dict[str, Any]] = []
+    logs: tuple[list[dict[str, Any]], ...] = ([], [])
+
+    def keep(state: dict[str, Any]) -> None:
+        file = io.BytesIO()
+        torch.save(state, file)
+        file.seek(0)
+        states.append(torch.load(file, weights_only=True))
+
+    straight = fit(
+        make_net(), make_rows(), options, on_checkpoint=keep, log=logs[0].append, progress=False,
+        evaluate=lambda: {"flow/cosine": 0.5},
+    )  # fmt: skip
+    assert [state["step"] for state in states] == [3, 6, 7]
+    resumed = fit(
+        make_net(seed=9), make_rows(), options, resume=states[0], log=logs[1].append, progress=False,
+        evaluate=lambda: {"flow/cosine": 0.5},
+    )  # fmt: skip
+    assert same(straight, resumed)
+
+    def without_times(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [{key: value for key, value in row.items() if not key.startswith("time/")} for row in rows]
+
+    assert [row["step"] for row in logs[0]] == [2, 4, 6, 7, 7]
+    assert without_times(logs[0])[1:] == without_times(logs[1])
+
+    with pytest.raises(UserError, match="seed=0"):
+        fit(make_net(), make_rows(), FitOptions(steps=7, batch_size=4, lr=1e-3, schedule="one_cycle", seed=4),
+            resume=states[0], progress=False)  # fmt: skip
+
+
+def test_overfits_four_clouds() -> None:
+    rows = make_rows(rows=4)
+    losses: list[float] = []
+    options = FitOptions(steps=60, batch_size=4, lr=3e-3, rotate=False, log_every=1)
+    fit(make_net(), rows, options, log=lambda row: losses.append(row["train/loss"]), progress=False)
+    assert sum(losses[-3:]) / 3 < losses[0] / 10
+
+
+def test_ctrl_c_saves_after_a_whole_step_and_says_so() -> None:
+    saved: list[dict[str, Any]] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def interrupt(row: dict[str, Any]) -> None:
+        if row["step"] == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(UserError, match="Ctrl-C after step 2 of 5"):
+        fit(make_net(), make_rows(), FitOptions(steps=5, batch_size=2, log_every=1), log=interrupt,
+            on_checkpoint=saved.append, progress=False)  # fmt: skip
+    assert [state["step"] for state in saved] == [2]
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_every_pass_draws_every_row_once() -> None:
+    options = FitOptions(steps=1, batch_size=4)
+    drawn = torch.cat([batch_rows(step, 10, options) for step in range(5)])
+    assert sorted(drawn[:10].tolist()) == sorted(drawn[10:].tolist()) == list(range(10))
+    assert drawn[:10].tolist() != drawn[10:].tolist()
+    # More clouds in a batch than there are rows.
+    assert batch_rows(0, 3, FitOptions(steps=1, batch_size=8)).bincount().tolist() in ([3, 3, 2], [3, 2, 3], [2, 3, 3])
+
+
+def test_flow_loss_is_the_mean_squared_norm_over_valid_points() -> None:
+    predicted = torch.tensor([[[1.0, 2, 2], [0, 0, 0], [9, 9, 9]]])
+    valid = torch.tensor([[True, True, False]])
+    assert flow_loss(predicted, torch.zeros(1, 3, 3), valid).item() == pytest.approx(9 / 2)
+
+
+def test_rotation_is_counter_clockwise_and_keeps_z() -> None:
+    turned = rotate_about_z(torch.tensor([[[1.0, 0, 5], [0, 2, 0]]]), torch.tensor([math.pi / 2]))
+    torch.testing.assert_close(turned, torch.tensor([[[0.0, 1, 5], [-2, 0, 0]]]), atol=1e-6, rtol=0)
+
+
+def test_one_cycle_rises_to_lr_and_falls_to_zero() -> None:
+    options = FitOptions(steps=100, lr=1e-2, schedule="one_cycle")
+    rates = [learning_rate(step, options) for step in range(100)]
+    assert max(rates) == pytest.approx(1e-2)
+    assert rates.index(max(rates)) == 9
+    assert rates[0] < 2e-3
+    assert rates[-1] == pytest.approx(0.0)
+
+
+def test_mistakes_are_named() -> None:
+    with pytest.raises(UserError, match="schedule=cosine is unknown"):
+        FitOptions(steps=1, schedule="cosine")
+    with pytest.raises(UserError, match="no clouds"):
+        fit(make_net(), make_rows(0), FitOptions(steps=1), progress=False)
+    rows = make_rows()
+    rows["privileged", "flow"][:] = torch.nan
+    with pytest.raises(UserError, match="loss is nan"):
+        fit(make_net(), rows, FitOptions(steps=1), progress=False)
