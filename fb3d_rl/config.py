@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
 
 from fb3d_rl.contract import UserError
 
@@ -78,11 +77,33 @@ class AlgoConfig:
     schedule: str
     clip_norm: float | None
     rotate: bool
+    mirror: bool
+    scale: float
     log_every: int
     evaluate_every: int | None
     checkpoint_every: int | None
     neighbors: int
     part_mask_input: bool
+
+
+@dataclass
+class GripperConfig:
+    """Part of fb3d_rl.env.options.GripperOptions."""
+
+    v_max: float
+    w_max: float
+    force_limit: float
+
+
+@dataclass
+class SuctionConfig:
+    """Part of fb3d_rl.env.options.SuctionOptions."""
+
+    hold: str
+    stiffness: float
+    damping: float
+    breaking_force: float
+    max_stretch: float
 
 
 @dataclass
@@ -97,17 +118,40 @@ class EnvConfig:
     joint_friction: float
     joint_damping: float
     density: float
-    gripper: dict[str, float]
-    suction: dict[str, Any]
+    hollow: float
+    gripper: GripperConfig
+    suction: SuctionConfig
+
+
+@dataclass
+class FlowConfig:
+    """Part of fb3d_rl.policies.flow_policy.FlowPolicyOptions."""
+
+    travel_speed: float
+    approach_speed: float
+    touch_speed: float
+    pull_speed: float
+    angular_gain: float
+    precontact: float
+    force: float
+
+
+@dataclass
+class ContactConfig:
+    """Part of fb3d_rl.perception.contact.ContactOptions."""
+
+    curvature: float
+    min_distance: float
+    facing: float
 
 
 @dataclass
 class PolicyConfig:
-    """fb3d_rl.policies.flow_policy.FlowPolicyOptions; ``name`` chooses where the flow comes from."""
+    """The flow policy; ``name`` chooses where the flow comes from."""
 
     name: str
-    flow: dict[str, float]
-    contact: dict[str, float]
+    flow: FlowConfig
+    contact: ContactConfig
 
 
 @dataclass
@@ -164,6 +208,7 @@ def validate(cfg: TrainConfig | EvaluateConfig) -> None:
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
     _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+    _one_of("env.suction.hold", cfg.env.suction.hold, ("target", "any"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
         _one_of("algo.name", cfg.algo.name, ("artflownet",))

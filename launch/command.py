@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -35,6 +36,7 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:
         out = Path(HydraConfig.get().runtime.output_dir)
+        fresh = not any(out.iterdir())
         with _one_sentence():
             try:
                 cfg: Any = OmegaConf.to_object(raw)
@@ -42,8 +44,9 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
                 OmegaConf.save(raw, out / "config.yaml")
                 task(cfg, out)
             except UserError:
-                if not any(out.iterdir()):
-                    out.rmdir()  # Hydra made it; a run that never began leaves no folder
+                # A run that never began leaves no folder.
+                if fresh and {path.name for path in out.iterdir()} <= {"config.yaml"}:
+                    shutil.rmtree(out)
                 raise
 
     with _one_sentence():

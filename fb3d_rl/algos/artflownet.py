@@ -35,10 +35,13 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     Returns:
         One row for each scheduled trial and policy.
     """
+    # Whatever the configuration can get wrong shows here, before any work.
     device = setup.choose_device(cfg.device)
+    protocol = setup.protocol(cfg)
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     options = fit_options(cfg)
-    samples = setup.sample_options(cfg)
+    samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)
 
@@ -74,10 +77,9 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         fit(net, buffer, options, device=device, evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
             resume=resume["state"] if resume else None)  # fmt: skip
 
-    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     policies["artflownet"] = artflownet_policy(net.to("cpu"), limits, speeds)
-    return evaluate(out, objects, policies, setup.protocol(cfg), setup.facts(cfg), net, torch.device("cpu"))
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
 
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
@@ -90,6 +92,8 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
         schedule=algo.schedule,
         clip_norm=algo.clip_norm,
         rotate=algo.rotate,
+        mirror=algo.mirror,
+        scale=algo.scale,
         seed=cfg.seed,
         log_every=algo.log_every,
         evaluate_every=algo.evaluate_every,
@@ -98,10 +102,8 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
 
 
 def new_network(seed: int, **kwargs: Any) -> ArtFlowNet:
-    """A network with initial weights that depend on the seed alone; the global generator is left as it was."""
-    with torch.random.fork_rng(devices=[]):
-        torch.random.default_generator.manual_seed(seed)
-        return ArtFlowNet(**kwargs)
+    """A network with initial weights that depend on the seed alone."""
+    return ArtFlowNet(**kwargs, generator=torch.Generator().manual_seed(seed))
 
 
 def load_network(path: str | Path) -> ArtFlowNet:
@@ -118,12 +120,13 @@ def load_network(path: str | Path) -> ArtFlowNet:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate the expert, or a trained ArtFlowNet beside the expert."""
+    protocol = setup.protocol(cfg)
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     net = load_network(cfg.checkpoint) if cfg.policy.name == "artflownet" and cfg.checkpoint else None
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
-    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     policies: dict[str, Any] = {}
     if cfg.policy.name == "expert" or cfg.evaluation.expert:
         policies["expert"] = expert_policy(limits, speeds)
     if net is not None:
         policies["artflownet"] = artflownet_policy(net, limits, speeds)
-    return evaluate(out, objects, policies, setup.protocol(cfg), setup.facts(cfg), net)
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)

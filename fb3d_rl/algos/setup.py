@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,8 +67,8 @@ def env_options(cfg: TrainConfig | EvaluateConfig) -> EnvOptions:
     """The task's constants."""
     env = cfg.env
     return EnvOptions(
-        gripper=_override(GripperOptions(), env.gripper, "env.gripper"),
-        suction=_override(SuctionOptions(), env.suction, "env.suction"),
+        gripper=GripperOptions(**asdict(env.gripper)),
+        suction=SuctionOptions(**asdict(env.suction)),
         points=cfg.data.points,
         horizon=env.horizon,
         success=env.success,
@@ -78,14 +78,14 @@ def env_options(cfg: TrainConfig | EvaluateConfig) -> EnvOptions:
         joint_friction=env.joint_friction,
         joint_damping=env.joint_damping,
         density=env.density,
+        hollow=env.hollow,
         camera=CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin),
     )
 
 
 def flow_policy_options(cfg: TrainConfig | EvaluateConfig) -> FlowPolicyOptions:
     """Speeds and distances of the flow policy."""
-    contact = _override(ContactOptions(), cfg.policy.contact, "policy.contact")
-    return _override(FlowPolicyOptions(contact=contact), cfg.policy.flow, "policy.flow")
+    return FlowPolicyOptions(**asdict(cfg.policy.flow), contact=ContactOptions(**asdict(cfg.policy.contact)))
 
 
 def velocity_limits(cfg: TrainConfig | EvaluateConfig) -> VelocityLimits:
@@ -132,10 +132,3 @@ def facts(cfg: TrainConfig | EvaluateConfig) -> dict[str, Any]:
         f"torch {torch.__version__}",
         "assets": asdict(cfg.assets),
     }
-
-
-def _override(options: Any, values: dict[str, Any], key: str) -> Any:
-    unknown = set(values) - set(asdict(options))
-    if unknown:
-        raise UserError(f"{key}.{sorted(unknown)[0]} is no such key; choose from {', '.join(asdict(options))}")
-    return replace(options, **values)

@@ -30,7 +30,7 @@ class Entry:
 
 
 def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_out: int, seed: int) -> list[Entry]:
-    """Make ``count`` training and ``held_out`` test objects of each category below ``out``.
+    """Make ``count`` training and ``held_out`` test objects (0 for none) of each category below ``out``.
 
     Raises:
         UserError: a category has no procedural family.
@@ -43,6 +43,8 @@ def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_ou
     entries = []
     # Held-out objects come from another seed, so no training object can be among them.
     for split, number, part_seed in (("train_train", count, 2 * seed), ("train_test", held_out, 2 * seed + 1)):
+        if number == 0:
+            continue
         ids = procedural.generate(out / split, categories, number, part_seed)
         entries += [Entry(out / split / name, _category(out / split / name), split) for name in ids]
     return entries
@@ -76,5 +78,5 @@ def partnet_catalog(root: str | None, split: str, split_file: str | None = None)
 def _category(folder: Path) -> str:
     try:
         return str(json.loads((folder / "meta.json").read_text(encoding="utf-8"))["model_cat"])
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return "unknown"  # load_object says what is wrong with a broken file

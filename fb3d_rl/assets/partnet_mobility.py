@@ -44,12 +44,20 @@ def load_object(folder: str | Path) -> ArticulatedObject:
     if not urdf.is_file():
         raise UserError(f"object {folder.name}: {urdf} does not exist, so the folder is no PartNet-Mobility object")
     try:
-        robot = ElementTree.parse(urdf).getroot()
+        robot = _parse(urdf)
         return _Reader(folder).read(robot)
     except (ParseError, DefusedXmlException) as error:
         raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
     except OSError as error:
         raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
+
+
+def _parse(urdf: Path) -> Element:
+    try:
+        root: Element = ElementTree.parse(urdf).getroot()
+    except (LookupError, ValueError) as error:  # the XML declaration names an encoding that Python's parser lacks
+        raise ParseError(str(error)) from error
+    return root
 
 
 class _Reader:
@@ -61,7 +69,12 @@ class _Reader:
         self.dropped: list[str] = []
 
     def read(self, robot: Element) -> ArticulatedObject:
-        elements = {self.attribute(e, "name"): e for e in robot.findall("link")}
+        elements: dict[str, Element] = {}
+        for element in robot.findall("link"):
+            name = self.attribute(element, "name")
+            if name in elements:
+                self.fail(f"two links are called {name!r}")
+            elements[name] = element
         joints: dict[str, tuple[str, Joint]] = {}
         for element in robot.findall("joint"):
             parent, child, joint = self.joint(element)
@@ -138,8 +151,8 @@ class _Reader:
             if axis_element is None:
                 axis[0] = 1.0  # URDF's default
             length = float(np.linalg.norm(axis))
-            if length < 1e-9:
-                self.fail(f"joint {name} has an axis of length 0")
+            if not 1e-9 <= length < math.inf:
+                self.fail(f"joint {name} has an axis of length {length:.3g}")
             axis = axis / length
             limits = (-math.inf, math.inf) if kind == "continuous" else self.limits(element, name)
         joint_type: JointType = kind  # type: ignore[assignment]
@@ -201,6 +214,8 @@ class _Reader:
             return self.meshes[path]
         if not path.is_relative_to(self.folder.resolve()):
             self.fail(f"the mesh path {filename!r} leaves the object's folder")
+        if path.suffix.lower() != ".obj":
+            self.fail(f"the mesh {filename} is no .obj file")
         if not path.is_file():
             self.fail(f"the mesh {filename} is missing")
         try:
@@ -234,7 +249,7 @@ class _Reader:
             return "unknown"
         try:
             meta = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:
             raise UserError(f"object {self.folder.name}: {path} is no valid JSON ({error})") from error
         return str(meta.get("model_cat", "unknown")) if isinstance(meta, dict) else "unknown"
 

@@ -29,8 +29,8 @@ class GripperOptions:
         distance: distance (m) of the hand's origin in front of the object at the start.
     """
 
-    v_max: float = 1.0
-    w_max: float = 2.0
+    v_max: float = 2.0
+    w_max: float = 3.0
     f_max: float = 0.05
     force_limit: float = 3000.0
     torque_limit: float = 300.0
@@ -83,7 +83,11 @@ class EnvOptions:
         joint_friction: PhysX's friction coefficient of the object's joints.
         joint_damping: rate (1/s) at which a joint that nobody pushes loses its speed. It is per inertia, since parts
             weigh from grams to 100 kg: light ones stay easy to open and heavy ones do not coast on after a push.
-        density: of the object's parts, kg/m^3.
+        density: of the object's parts, kg/m^3. Parts are hollow, but their hulls are solid and overlap: at the density
+            of wood a wide drawer would weigh 600 kg.
+        hollow: a mesh that cannot move collides as its surface, and not as its convex hull, if the hull covers more
+            than this fraction of a movable part: a pot's hull is closed, so the lid within could not be touched.
+            1 keeps every hull.
     """
 
     gripper: GripperOptions = field(default_factory=GripperOptions)
@@ -97,7 +101,8 @@ class EnvOptions:
     gravity: bool = False
     joint_friction: float = 0.1
     joint_damping: float = 5.0
-    density: float = 1000.0
+    density: float = 100.0
+    hollow: float = 0.5
 
 
 @dataclass(frozen=True)

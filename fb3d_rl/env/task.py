@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ from sapien.physx import (
     PhysxArticulationLinkComponent,
     PhysxCollisionShapeBox,
     PhysxCollisionShapeConvexMesh,
+    PhysxCollisionShapeTriangleMesh,
+    PhysxRigidStaticComponent,
     get_default_material,
 )
 from torch import Tensor
@@ -49,7 +51,8 @@ class OpenArticulatedEnv(BaseEnv):
     A floating suction gripper, commanded by eight velocities, opens the given part (a door, a drawer, a lid ...) of an
     object whose base is fixed. It sees the object as a cloud of points from one camera. Suction holds the part as
     soon as a finger touches it. Contact between gripper, object and ground is physical; the object's parts do not
-    collide with each other. The collision shape of a part is the convex hull of each of its collision meshes.
+    collide with each other. The collision shape of a part is the convex hull of each of its collision meshes, but for
+    hollow bodies such as a pot (``options.hollow``).
 
     **Randomizations:**
     None of its own: a :class:`~fb3d_rl.env.options.Trial`, handed to ``reset(options={"trial": trial})``, fixes the
@@ -65,7 +68,7 @@ class OpenArticulatedEnv(BaseEnv):
     Args:
         objects: the objects that trials may name.
         options: the task's constants.
-        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", or "state" without any points.
+        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "state_dict" (no points) or "none".
 
     Raises:
         UserError: there is no object, or the first one has nothing to open.
@@ -86,6 +89,7 @@ class OpenArticulatedEnv(BaseEnv):
         self.options = options or EnvOptions()
         self.trial = default_trial(next(iter(self.objects.values())))
         self._cameras: dict[str, RaycastCamera] = {}
+        self._hollow: dict[str, frozenset[tuple[int, int]]] = {}
         super().__init__(
             robot_uids=FloatingSuctionGripper.uid,
             sim_config=dict(sim_freq=self.options.sim_freq, control_freq=self.options.control_freq),
@@ -134,7 +138,7 @@ class OpenArticulatedEnv(BaseEnv):
         # BaseEnv collects garbage here, which takes 0.2 s with torch loaded; the scene is freed without it.
         self._close_viewer()
         self.scene = None
-        for name in ("agent", "suction", "articulation", "_links", "_bodies"):
+        for name in ("agent", "suction", "articulation", "_links", "_bodies", "_static"):
             self.__dict__.pop(name, None)
 
     def _load_agent(self, options: dict[str, Any]) -> None:
@@ -158,6 +162,12 @@ class OpenArticulatedEnv(BaseEnv):
         self.articulation = _build(self, self.object, base, self.options)
         links = self.articulation.links_map
         self._links: list[PhysxArticulationLinkComponent] = [links[link.name]._objs[0] for link in self.object.links]
+        if self.object.id not in self._hollow:
+            self._hollow[self.object.id] = _hollow_meshes(self.object, self.tree, self.options.hollow)
+        self._static = _add_shapes(self.object, self._links, self._hollow[self.object.id], self.options.density)
+        entity = sapien.Entity()
+        entity.add_component(self._static)
+        self.scene.sub_scenes[0].add_entity(entity)
         own = self.agent.robot.links_map
         self._bodies = [own[name]._objs[0] for name in BODIES]
         active = [joint.child_link.name for joint in self.articulation.active_joints]
@@ -180,7 +190,8 @@ class OpenArticulatedEnv(BaseEnv):
         qpos = torch.zeros(self.num_envs, len(self._order))
         qpos[:, self._order] = torch.tensor(self.trial.start, dtype=torch.float32)
         self.articulation.set_qpos(qpos)
-        boxes = np.stack([link.compute_global_aabb_tight() for link in self._links if link.collision_shapes])
+        solid = [body for body in (*self._links, self._static) if body.collision_shapes]
+        boxes = np.stack([body.compute_global_aabb_tight() for body in solid])
         low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
         hand = torch.zeros(self.num_envs, 8)
         hand[:, 0] = float(low[0]) - self.options.gripper.distance
@@ -330,20 +341,70 @@ def _build(env: OpenArticulatedEnv, obj: ArticulatedObject, base: NDArray[np.flo
             axis,
         )
     articulation: Articulation = builder.build(name="object", fix_root_link=True)
-    for link in obj.links:
-        body = articulation.links_map[link.name]._objs[0]
-        for mesh in link.collisions:
-            # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
-            shape = PhysxCollisionShapeConvexMesh(
-                mesh.vertices.astype(np.float32), [1.0, 1.0, 1.0], get_default_material()
-            )
-            shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
-            shape.set_density(o.density)
-            body.attach(shape)
     for joint in articulation.active_joints:
         joint.set_friction(o.joint_friction)
         joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
     return articulation
+
+
+def _hollow_meshes(obj: ArticulatedObject, tree: KinematicTree, fraction: float) -> frozenset[tuple[int, int]]:
+    """(link, collision mesh) of what cannot move and whose hull covers more than ``fraction`` of a closed part."""
+    closed, _ = opening_range(obj)
+    poses = tree.forward(torch.as_tensor(closed)).numpy()
+
+    def in_base(link: int, mesh: Mesh) -> NDArray[np.float64]:
+        return np.asarray(mesh.vertices @ poses[link, :3, :3].T + poses[link, :3, 3])
+
+    moves = tree.descendants.any(0).tolist()
+    parts = [
+        np.concatenate([in_base(i, mesh) for mesh in link.visuals])
+        for i, link in enumerate(obj.links)
+        if moves[i] and link.visuals
+    ]
+    found = set()
+    for i, link in enumerate(obj.links):
+        for k, mesh in enumerate(() if moves[i] else link.collisions):
+            points = in_base(i, mesh)
+            low, high = points.min(0), points.max(0)
+            # Cheap test first: most meshes are boards, whose bounding box holds no part.
+            boxed = [part for part in parts if ((part > low) & (part < high)).all(-1).mean() > fraction]
+            if boxed:
+                hull = PhysxCollisionShapeConvexMesh(points.astype(np.float32), [1.0, 1.0, 1.0], get_default_material())
+                corners = hull.vertices[hull.triangles]
+                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+                heights = (normals * corners[:, 0]).sum(-1)
+                outward = np.sign(heights - normals @ hull.vertices.mean(0))
+                covered = [((part @ normals.T - heights) * outward < 0).all(-1).mean() for part in boxed]
+                if max(covered) > fraction:
+                    found.add((i, k))
+    return frozenset(found)
+
+
+def _add_shapes(
+    obj: ArticulatedObject,
+    links: Sequence[PhysxArticulationLinkComponent],
+    hollow: frozenset[tuple[int, int]],
+    density: float,
+) -> PhysxRigidStaticComponent:
+    """Give the links the convex hull of each collision mesh; the result has the hollow ones, as surfaces.
+
+    Only a static body can have a surface as its shape.
+    """
+    static = PhysxRigidStaticComponent()
+    material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
+    for i, (link, component) in enumerate(zip(obj.links, links, strict=True)):
+        for k, mesh in enumerate(link.collisions):
+            vertices = mesh.vertices.astype(np.float32)
+            if (i, k) in hollow:
+                shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
+                shape.local_pose = component.entity_pose
+            else:
+                # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
+                shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
+                shape.set_density(density)
+            shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
+            (static if (i, k) in hollow else component).attach(shape)
+    return static
 
 
 def _axis_frame(joint: Joint) -> NDArray[np.float64]:

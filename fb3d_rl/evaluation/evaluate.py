@@ -58,7 +58,6 @@ def evaluate(
     protocol: Protocol,
     facts: Mapping[str, Any],
     net: ArtFlowNet | None = None,
-    device: torch.device | None = None,
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
@@ -70,8 +69,7 @@ def evaluate(
         policies: name -> policy.
         protocol: what is evaluated.
         facts: entries for summary.json (seed, command, git revision ...).
-        net: the flow network to measure.
-        device: where the network runs.
+        net: the flow network to measure, on the CPU.
 
     Returns:
         One row for each scheduled trial and policy.
@@ -79,7 +77,7 @@ def evaluate(
     numbers: dict[str, Any] = dict(facts)
     measured: list[FlowRow] = []
     if net is not None:
-        measured, extra = _measure_flow(out, net, device or torch.device("cpu"), objects, protocol)
+        measured, extra = _measure_flow(out, net, objects, protocol)
         numbers |= extra
         write_flow(out / "flow_rows.csv", measured)
     scheduled, hidden = schedule(objects, protocol.samples, protocol.seed, protocol.trials)
@@ -104,17 +102,15 @@ def evaluate(
 def _measure_flow(
     out: Path,
     net: ArtFlowNet,
-    device: torch.device,
     objects: Sequence[tuple[ArticulatedObject, str]],
     protocol: Protocol,
 ) -> tuple[list[FlowRow], dict[str, Any]]:
     """Rows of the target "part"; the numbers of the target "all" for summary.json; clouds for the report."""
     measured: list[FlowRow] = []
     extra: dict[str, Any] = {}
-    net = net.to(device)
     sets = held_out_samples(objects, protocol.samples, protocol.samples_per_object, protocol.seed)
     for target, (samples, about) in sets.items():
-        predicted = predict(net, samples, device)
+        predicted = predict(net, samples, torch.device("cpu"))
         rows = flow_rows(predicted, samples, about)
         if target == "part":
             measured = rows

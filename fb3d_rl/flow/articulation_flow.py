@@ -37,10 +37,11 @@ def articulation_flow(
     dtype = tree.origins.dtype
     base, world = base.to(dtype), points.to(dtype)
     half = 0.5 * STEP * direction.to(dtype)
-    # P = T_world_link(q +- half) T_world_link(q)^-1 moves a world point along with its link.
-    at_rest = inverse(base[..., None, :, :] @ tree.forward(qpos))
-    ahead = base[..., None, :, :] @ tree.forward(qpos.to(dtype) + half) @ at_rest
-    behind = base[..., None, :, :] @ tree.forward(qpos.to(dtype) - half) @ at_rest
+    position = qpos.to(dtype)
+    poses = base[..., None, :, :] @ tree.forward(torch.stack([position, position + half, position - half]))
+    # T_world_link(q +- half) T_world_link(q)^-1 moves a world point along with its link.
+    at_rest = inverse(poses[0])
+    ahead, behind = poses[1] @ at_rest, poses[2] @ at_rest
     change = ahead - behind  # [..., L, 4, 4], exactly 0 for links that stand still
     index = links.clamp_min(0)[..., None, None].expand(*links.shape, 4, 4)
     per_point = change.gather(-3, index)

@@ -72,9 +72,11 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 def rigid(rotation: Tensor, translation: Tensor) -> Tensor:
     """Transforms [..., 4, 4] of rotations [..., 3, 3] and translations [..., 3]."""
     batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    top = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3).unsqueeze(-1)], dim=-1)
-    bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=top.dtype, device=top.device)
-    return torch.cat([top, bottom.expand(*batch, 1, 4)], dim=-2)
+    transform = torch.zeros(*batch, 4, 4, dtype=rotation.dtype, device=rotation.device)
+    transform[..., :3, :3] = rotation
+    transform[..., :3, 3] = translation
+    transform[..., 3, 3] = 1.0
+    return transform
 
 
 def inverse(transform: Tensor) -> Tensor:

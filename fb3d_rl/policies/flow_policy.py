@@ -47,6 +47,9 @@ class FlowPolicyOptions:
         patience: control steps for which that force is borne, since suction may still engage.
         retry_distance: points nearer (m) than this to a point tried in vain are not tried.
         neighbors: nearest moving points whose mean flow is the flow at the held point.
+        hand_length: from the tip to the hand's far end, m.
+        clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
+            between itself and the ground z = 0.
         margin: distance (m) that the tip keeps from the object's bounding sphere while it travels.
     """
 
@@ -61,6 +64,8 @@ class FlowPolicyOptions:
     patience: int = 4
     retry_distance: float = 0.08
     neighbors: int = 8
+    hand_length: float = 0.2
+    clearance: float = 0.08
     margin: float = 0.1
     contact: ContactOptions = field(default_factory=ContactOptions)
 
@@ -132,7 +137,7 @@ class FlowPolicy(TensorDictModuleBase):
 
         # The hand keeps its angle to the flow: what turns the flow at contact into the flow now turns the hand.
         turned = rotation_vector_to_matrix(alignment(state["contact_flow"], state["pull"]))
-        wanted = (turned @ state["standoff"][..., None]).squeeze(-1)
+        wanted = self._above_ground((turned @ state["standoff"][..., None]).squeeze(-1), tip)
         angular = o.angular_gain * alignment(hand, wanted)
         tensordict["action"] = self._joint_velocities(obs, tip, hand, velocity, angular)
         tensordict["next", "policy"] = state
@@ -242,6 +247,14 @@ class FlowPolicy(TensorDictModuleBase):
         near_flow = flow.gather(1, nearest.indices[..., None].expand(-1, -1, 3))
         mean = normalize(torch.where(use, near_flow, 0.0).sum(1))
         return torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, last)
+
+    def _above_ground(self, axis: Tensor, tip: Tensor) -> Tensor:
+        """Lift unit hand axes [E, 3] that would take the hand's far end below ``clearance``."""
+        lowest = ((self.options.clearance - tip[..., 2:]) / self.options.hand_length).clamp(-1.0, 0.9)
+        height = torch.maximum(axis[..., 2:], lowest)
+        flat = normalize(axis[..., :2])
+        lifted = torch.cat([flat * (1 - height.square()).sqrt(), height], dim=-1)
+        return torch.where(height > axis[..., 2:], lifted, axis)
 
     def _joint_velocities(
         self, obs: TensorDictBase, tip: Tensor, hand: Tensor, velocity: Tensor, angular: Tensor

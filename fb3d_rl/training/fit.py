@@ -40,6 +40,9 @@ class FitOptions:
         schedule: "constant", or "one_cycle": up from lr / 25 in the first tenth, then down a cosine to 0.
         clip_norm: largest norm of the gradient; None leaves it alone.
         rotate: turn every drawn cloud and its flow by a random angle about z.
+        mirror: reflect every other drawn cloud and its flow, at random, in the plane y = 0: a left-hinged door becomes
+            a right-hinged one.
+        scale: multiply every drawn cloud by a random factor from 1 - scale to 1 + scale.
         seed: of the rows drawn and of the rotations.
         log_every: steps from one log row to the next.
         evaluate_every: steps from one evaluation to the next; None only at the end.
@@ -53,6 +56,8 @@ class FitOptions:
     schedule: str = "constant"
     clip_norm: float | None = None
     rotate: bool = True
+    mirror: bool = False
+    scale: float = 0.0
     seed: int = 0
     log_every: int = 10
     evaluate_every: int | None = None
@@ -224,6 +229,13 @@ def fit(
         if options.rotate:
             angle = torch.rand(len(points), generator=_generator(options.seed, 2, step)).to(device) * (2 * math.pi)
             points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
+        if options.mirror or options.scale:
+            draws = torch.rand(2, len(points), 1, 1, generator=_generator(options.seed, 3, step)).to(device)
+            if options.mirror:
+                reflect = torch.ones_like(points[:, :1])
+                reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
+                points, flow = points * reflect, flow * reflect
+            points = points * (1 + options.scale * (2 * draws[1] - 1))
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, options)
         optimizer.zero_grad()
@@ -283,7 +295,7 @@ def fit(
 
 def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:
     """Refuse to continue a run under options that would have led elsewhere."""
-    decisive = ["batch_size", "lr", "schedule", "clip_norm", "rotate", "seed"]
+    decisive = ["batch_size", "lr", "schedule", "clip_norm", "rotate", "mirror", "scale", "seed"]
     if options.schedule != "constant":
         decisive.append("steps")
     for name in decisive:

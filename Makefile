@@ -1,0 +1,38 @@
+# make train   .venv, then the main job on the embedded default
+# make test    .venv, then the default tests
+# make check   lint, types and import rules
+# make lock    pin the dependencies anew
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: train test check lock clean
+
+train: $(VENV)/installed
+	$(BIN)/python launch/train.py algo=artflownet
+
+test: $(VENV)/installed
+	$(BIN)/python -m pytest -m "not slow"
+
+check: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+# The file's date says when the lock was last installed.
+$(VENV)/installed: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(0 if (3, 10) <= sys.version_info < (3, 13) else "Python 3.10, 3.11 or 3.12 is needed; name one with: make PYTHON=python3.11")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
+	touch $@
+
+# torch pulls in its CUDA packages itself where its build needs them, so the lock leaves them out: it serves every machine.
+lock:
+	echo "torch==2.13.0" | $(BIN)/uv pip compile --universal --python-version 3.10 --extra dev --no-annotate --no-header \
+	  --constraint - pyproject.toml --quiet | grep -vE "^(nvidia-(c|n[vc])|cuda-|triton)" > requirements.lock.part
+	mv requirements.lock.part requirements.lock
+
+clean:
+	rm -rf $(VENV) *.egg-info
