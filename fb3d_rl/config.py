@@ -237,7 +237,9 @@ def validate(cfg: TrainConfig | EvaluateConfig) -> None:
             raise UserError(f"camera.{key}={ends} is no range; give two ascending angles in degrees, [lowest,highest]")
     if cfg.assets.source == "partnet_mobility":
         if not cfg.assets.root:
-            raise UserError("assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR")
+            raise UserError(
+                "assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR"
+            )
         if not os.path.isdir(cfg.assets.root):
             raise UserError(f"assets.root={cfg.assets.root} is no folder; give the one that holds <id>/mobility.urdf")
 

@@ -102,8 +102,6 @@ def check(td: TensorDictBase, group: str) -> None:
                 points = size if points is None else points
                 expected = points
             if size != expected:
-                raise ValueError(
-                    f"{group}: {key} has trailing shape {trailing}, the contract says {entry.shape}"
-                )
+                raise ValueError(f"{group}: {key} has trailing shape {trailing}, the contract says {entry.shape}")
         if value.dtype != entry.dtype:
             raise ValueError(f"{group}: {key} is {value.dtype}, the contract says {entry.dtype}")

@@ -70,9 +70,7 @@ def partnet_catalog(root: str | None, split: str, split_file: str | None = None)
     objects, skipped = load_objects(root, chosen)
     for item in skipped:
         log.warning("skipped: %s", item.reason)
-    return [
-        Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table)) for obj in objects
-    ]
+    return [Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table)) for obj in objects]
 
 
 def _category(folder: Path) -> str:

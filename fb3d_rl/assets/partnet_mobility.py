@@ -11,7 +11,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 from xml.etree.ElementTree import ParseError
 
 import numpy as np
@@ -86,13 +86,13 @@ class _Reader:
         semantics = self.semantics()
         links: list[Link] = []
         for name in self.parents_first(elements, joints):
-            parent, joint = joints.get(name, (None, None))
+            carried = joints.get(name)
             links.append(
                 Link(
                     name=name,
                     semantic=semantics.get(name, ""),
-                    parent=-1 if parent is None else [link.name for link in links].index(parent),
-                    joint=joint,
+                    parent=-1 if carried is None else [link.name for link in links].index(carried[0]),
+                    joint=None if carried is None else carried[1],
                     visuals=self.shapes(elements[name], "visual"),
                     collisions=self.shapes(elements[name], "collision"),
                 )
@@ -105,14 +105,13 @@ class _Reader:
             dropped=tuple(dict.fromkeys(self.dropped)),
         )
 
-    def fail(self, what: str) -> None:
+    def fail(self, what: str) -> NoReturn:
         raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.folder / URDF}")
 
     def attribute(self, element: Element, name: str) -> str:
         value = element.get(name)
         if value is None:
             self.fail(f"a <{element.tag}> has no attribute {name!r}")
-        assert value is not None
         return value
 
     def numbers(self, text: str | None, count: int, default: float) -> NDArray[np.float64]:
@@ -155,7 +154,7 @@ class _Reader:
                 self.fail(f"joint {name} has an axis of length {length:.3g}")
             axis = axis / length
             limits = (-math.inf, math.inf) if kind == "continuous" else self.limits(element, name)
-        joint_type: JointType = kind  # type: ignore[assignment]
+        joint_type: JointType = kind
         return parent, child, Joint(name, joint_type, self.origin(element), axis, limits)
 
     def limits(self, element: Element, name: str) -> tuple[float, float]:
@@ -220,10 +219,10 @@ class _Reader:
             self.fail(f"the mesh {filename} is missing")
         try:
             loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
+            vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+            faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
         except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:
             raise UserError(f"object {self.folder.name}: the mesh {filename} is broken ({error})") from error
-        vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all()):
             self.fail(f"the mesh {filename} has vertices that are missing or no numbers")
         corners = vertices[faces]

@@ -105,9 +105,7 @@ class RaycastCamera:
         """T_world_camera [4, 4] of a view; x right, y down, z forward."""
         return look_at(view, self.centre, self.distance)
 
-    def capture(
-        self, poses: NDArray[np.float64], view: View
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def capture(self, poses: NDArray[np.float64], view: View) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Take one depth image.
 
         Args:

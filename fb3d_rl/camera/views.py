@@ -34,9 +34,7 @@ class ViewRange:
 def look_at(view: View, centre: NDArray[np.float64], distance: float) -> NDArray[np.float64]:
     """T_world_camera [4, 4] of a camera at ``distance`` m from ``centre`` [3]; camera x right, y down, z forward."""
     azimuth, elevation = np.radians([180.0 + view.azimuth, view.elevation])
-    outward = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    outward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     forward = -outward
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     down = np.cross(forward, right)

@@ -62,6 +62,7 @@ def generate_samples(
     recipe = json.loads(json.dumps(recipe))
     done_file = out / DONE
     if done_file.is_file() and json.loads(done_file.read_text())["recipe"] == recipe:
+        progress(count)
         return TensorDict.load_memmap(out / "rows")
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)

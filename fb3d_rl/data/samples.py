@@ -105,7 +105,9 @@ class ObjectView:
         )
 
 
-def draw_sample(view: ObjectView, options: SampleOptions, rng: np.random.Generator, tries: int = 8) -> TensorDict | None:
+def draw_sample(
+    view: ObjectView, options: SampleOptions, rng: np.random.Generator, tries: int = 8
+) -> TensorDict | None:
     """Draw one sample of an object, or None if no openable part shows itself within ``tries`` views."""
     for _ in range(tries):
         link = int(rng.choice(view.openable))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
+
+warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # nothing is rendered
 
 import numpy as np
 import sapien

@@ -6,19 +6,21 @@ import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
+from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_text, write_trials
@@ -61,7 +63,7 @@ def evaluate(
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
-    Writes rows.csv, flow_rows.csv and clouds.npz (with ``net``), summary.json and report.html, and prints the table.
+    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, and prints the table.
 
     Args:
         out: the run folder.
@@ -89,14 +91,20 @@ def evaluate(
     with Progress(*columns) as bar:
         for name, policy in policies.items():
             task = bar.add_task(f"trials: {name}", total=len(scheduled))
-            rows += run_trials(name, policy, shown, scheduled, protocol.env, lambda row, t=task: bar.advance(t))
+            rows += run_trials(name, policy, shown, scheduled, protocol.env, partial(_advance, bar, task))
             write_trials(out / "rows.csv", rows)
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())
+    if net is not None:
+        write_picture(out)
     report = write_report(out)
     print(f"results: {out}\nreport:  {report}")
     return rows
+
+
+def _advance(bar: Progress, task: TaskID, row: TrialRow) -> None:
+    bar.advance(task)
 
 
 def _measure_flow(

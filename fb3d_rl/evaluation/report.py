@@ -237,9 +237,7 @@ def _headline(numbers: Mapping[str, Any]) -> str:
         if numbers[prefix + "n_error"]:
             counts += f", {numbers[prefix + 'n_error']} crashed"
         blocks.append(f"<h3>{text(policy)} · {counts}</h3>")
-        blocks.append(
-            page.cards(_card(m, numbers, prefix) for m in (SUCCESS, CONTACT, DISTANCE, MOTION_ONLY))
-        )
+        blocks.append(page.cards(_card(m, numbers, prefix) for m in (SUCCESS, CONTACT, DISTANCE, MOTION_ONLY)))
     if not blocks:
         return ""
     return "".join(blocks) + _reading([numbers])
@@ -305,13 +303,9 @@ def _finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _bars(
-    plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: Sequence[tuple[Any, Any]]
-) -> None:
+def _bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: Sequence[tuple[Any, Any]]) -> None:
     """Horizontal dots with intervals; ``cells`` are (value, interval), both may be None."""
-    known = [
-        (label, value, ends) for label, (value, ends) in zip(labels, cells, strict=True) if value is not None
-    ]
+    known = [(label, value, ends) for label, (value, ends) in zip(labels, cells, strict=True) if value is not None]
     ends = [interval if interval is not None else (value, value) for _, value, interval in known]
     plot.add_bar(
         orientation="h",
@@ -358,9 +352,7 @@ def _success_bars(numbers: Mapping[str, Any]) -> str:
 def _groups(numbers: Mapping[str, Any]) -> list[tuple[str, str, tuple[Metric, ...]]]:
     """(title, key prefix, metrics) of each group of columns."""
     trial = (CONTACT, SUCCESS, DISTANCE)
-    groups: list[tuple[str, str, tuple[Metric, ...]]] = (
-        [("flow", "", FLOW)] if tables.has_flow(numbers) else []
-    )
+    groups: list[tuple[str, str, tuple[Metric, ...]]] = [("flow", "", FLOW)] if tables.has_flow(numbers) else []
     return groups + [(policy, f"{policy}/", trial) for policy in tables.policies_of(numbers)]
 
 
@@ -453,9 +445,7 @@ def _cloud(
     size = 0.18 * float(np.linalg.norm(high - low))
     moving = np.flatnonzero((np.linalg.norm(true, axis=1) > 0) | (np.linalg.norm(predicted, axis=1) > 0.1))
     # Evenly through the cloud's order, so that a report is the same each time it is written.
-    chosen = (
-        moving[np.unique(np.linspace(0, len(moving) - 1, _ARROWS).astype(int))] if len(moving) else moving
-    )
+    chosen = moving[np.unique(np.linspace(0, len(moving) - 1, _ARROWS).astype(int))] if len(moving) else moving
 
     def arrows(flow: NDArray[np.float32]) -> dict[str, list[list[float]]]:
         kept = chosen[np.linalg.norm(flow[chosen], axis=1) > 0.02]

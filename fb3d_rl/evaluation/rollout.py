@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -99,10 +100,18 @@ def run_trials(
     return [rows[i] for i in range(len(scheduled))]
 
 
-def _episodes(env: ManiSkillEnv, policy: TensorDictModuleBase, count: int, horizon: int):  # type: ignore[no-untyped-def]
+def _episodes(
+    env: ManiSkillEnv, policy: TensorDictModuleBase, count: int, horizon: int
+) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield (place in the env's list of trials, what its row says) for each finished episode."""
     collector = Collector(
-        policy_env(env), policy, frames_per_batch=horizon, total_frames=-1, trust_policy=True, use_buffers=False
+        policy_env(env),
+        policy,
+        frames_per_batch=horizon,
+        total_frames=-1,
+        trust_policy=True,
+        use_buffers=False,
+        auto_register_policy_transforms=False,
     )
     finished: set[int] = set()
     episode = _Episode()
@@ -117,13 +126,16 @@ def _episodes(env: ManiSkillEnv, policy: TensorDictModuleBase, count: int, horiz
                     success = bool(frame["next", "success"])
                     if place not in finished:
                         finished.add(place)
-                        yield place, dict(
-                            steps=episode.steps,
-                            contact=bool(frame["next", "contact"]),
-                            success=success,
-                            normalized_distance=distance,
-                            attach_step=episode.attach_step,
-                            failure="" if success else episode.failure(distance),
+                        yield (
+                            place,
+                            dict(
+                                steps=episode.steps,
+                                contact=bool(frame["next", "contact"]),
+                                success=success,
+                                normalized_distance=distance,
+                                attach_step=episode.attach_step,
+                                failure="" if success else episode.failure(distance),
+                            ),
                         )
                     episode = _Episode()
                 if len(finished) == count:
@@ -132,9 +144,9 @@ def _episodes(env: ManiSkillEnv, policy: TensorDictModuleBase, count: int, horiz
         collector.shutdown(close_env=False)
 
 
-def _row(index: int, name: str, item: Scheduled, **outcome: object) -> TrialRow:
+def _row(index: int, name: str, item: Scheduled, **outcome: Any) -> TrialRow:
     trial = item.trial
     return TrialRow(
         trial=index, policy=name, object=trial.object, category=item.category, split=item.split, link=item.link,
-        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, **outcome,  # type: ignore[arg-type]
+        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, **outcome,
     )  # fmt: skip

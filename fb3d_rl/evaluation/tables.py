@@ -78,9 +78,7 @@ FLOW = (
 )
 CONTACT = Metric("contact_rate", "contact", "contact", percent=True, proportion=True)
 SUCCESS = Metric("success_rate", "success", "success", percent=True, proportion=True)
-MOTION_ONLY = Metric(
-    "motion_only_success_rate", "motion-only success", "motion", percent=True, proportion=True
-)
+MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, proportion=True)
 DISTANCE = Metric("normalized_distance", "normalized distance", "dist.", percent=False, proportion=True)
 TRIAL = (CONTACT, SUCCESS, MOTION_ONLY, DISTANCE)
 
@@ -184,9 +182,7 @@ def _measure(
     return out
 
 
-def _aggregate(
-    rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | None, classes: bool
-) -> dict[str, Any]:
+def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | None, classes: bool) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if flow:
         out |= _measure(flow, FLOW, "", classes)
@@ -288,9 +284,7 @@ def tables(numbers: Mapping[str, Any]) -> list[Table]:
 def _table(numbers: Mapping[str, Any], names: Sequence[str], flow: bool) -> Table:
     # One wide row of tables under the policies' names, because rich has no headers that span columns. All
     # inner rows are one line high, so they line up.
-    groups = [("flow", FLOW, "")] * flow + [
-        (name, (CONTACT, SUCCESS, DISTANCE), f"{name}/") for name in names
-    ]
+    groups = [("flow", FLOW, "")] * flow + [(name, (CONTACT, SUCCESS, DISTANCE), f"{name}/") for name in names]
     labels = _inner()
     labels.add_column("category", no_wrap=True, min_width=13, max_width=16)
     inner = [_inner() for _ in groups]

@@ -43,9 +43,7 @@ def _bounds(
 ) -> NDArray[np.float64]:
     """Bounds [2, 3] of the vertices of ``links`` in the base frame at joint state ``qpos`` [J]."""
     poses = tree.forward(torch.as_tensor(qpos)).numpy()
-    points = [
-        mesh.vertices @ poses[i, :3, :3].T + poses[i, :3, 3] for i in links for mesh in obj.links[i].visuals
-    ]
+    points = [mesh.vertices @ poses[i, :3, :3].T + poses[i, :3, 3] for i in links for mesh in obj.links[i].visuals]
     stacked = np.concatenate(points) if points else np.zeros((1, 3))
     return np.stack([stacked.min(0), stacked.max(0)])
 

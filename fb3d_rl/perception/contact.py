@@ -74,7 +74,13 @@ def choose_contact(
     smooth = (curvature <= options.curvature) & ~_rim(points, on_part, options)
     free = ~_blocked(points, valid, standoff, options)
     fresh = ~avoid
-    tiers = [movable & smooth & free & fresh, movable & free & fresh, movable & smooth & fresh, movable & fresh, movable]
+    tiers = [
+        movable & smooth & free & fresh,
+        movable & free & fresh,
+        movable & smooth & fresh,
+        movable & fresh,
+        movable,
+    ]
     score = torch.stack([tier.any(-1) for tier in tiers], dim=-1).int().argmax(-1)  # the first tier with a point
     good = torch.stack(tiers, dim=1).gather(1, score[:, None, None].expand(-1, 1, valid.shape[1])).squeeze(1)
 

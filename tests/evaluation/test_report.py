@@ -51,13 +51,8 @@ def fill(run: Path) -> list[TrialRow]:
     numbers = summary(rows, flow, {"seed": 5, "git_revision": "cafe01", "command": f"train {EVIL}"})
     (run / "summary.json").write_text(json.dumps(numbers))
     (run / "config.yaml").write_text(f"name: {EVIL}\n")
-    log = [
-        {"step": i, "train/loss": 1 / (i + 1), "val/cosine": float("nan") if i == 3 else 0.5}
-        for i in range(9)
-    ]
-    (run / "metrics.jsonl").write_text(
-        "".join(json.dumps(entry) + "\n" for entry in log) + '{"step": 9, "tra'
-    )
+    log = [{"step": i, "train/loss": 1 / (i + 1), "val/cosine": float("nan") if i == 3 else 0.5} for i in range(9)]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in log) + '{"step": 9, "tra')
     rng = np.random.default_rng(0)
     points = rng.normal(size=(3, 50, 3)).astype(np.float32)
     valid = np.ones((3, 50), dtype=bool)

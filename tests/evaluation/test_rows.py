@@ -28,9 +28,7 @@ def test_trials_round_trip_exactly(tmp_path: Path) -> None:
     rows = [
         trial(normalized_distance=0.1 + 0.2, contact=True, steps=150, attach_step=12, failure="too short"),
         trial(normalized_distance=1e-17, contact=True, success=True),
-        trial(
-            status="error", error='line 1\r\nline 2, "quoted"; <b>\udcff', failure="crashed", object="a,b\n"
-        ),
+        trial(status="error", error='line 1\r\nline 2, "quoted"; <b>\udcff', failure="crashed", object="a,b\n"),
     ]
     write_trials(tmp_path / "rows.csv", rows)
     assert read_trials(tmp_path / "rows.csv") == rows

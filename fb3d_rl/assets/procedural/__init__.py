@@ -52,9 +52,7 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
         UserError: If the category has no family or the seed is negative.
     """
     if category not in FAMILIES:
-        raise UserError(
-            f"No procedural family for category {category!r}: choose among {', '.join(FAMILIES)}."
-        )
+        raise UserError(f"No procedural family for category {category!r}: choose among {', '.join(FAMILIES)}.")
     if seed < 0:
         raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])

@@ -66,9 +66,7 @@ class Carcass:
     free_swing: Range = (1.4, 2.2)
 
 
-def scaled_size(
-    width: float, height: float, depth: float, diagonal: float = 1.94
-) -> tuple[float, float, float]:
+def scaled_size(width: float, height: float, depth: float, diagonal: float = 1.94) -> tuple[float, float, float]:
     """The proportions as a size (m) with the given diagonal; PartNet's is 2 m, handles included."""
     scale = diagonal / float(np.linalg.norm([width, height, depth]))
     return width * scale, height * scale, depth * scale
@@ -119,9 +117,7 @@ def build(rng: np.random.Generator, carcass: Carcass) -> tuple[list[Piece], list
         px, py = (cell_x[0] - grow, cell_x[1] + grow), (cell_y[0] - grow, cell_y[1] + grow)
         for k in range(cell.shelves):
             at = cell_y[0] + (cell_y[1] - cell_y[0]) * (k + 1) / (cell.shelves + 1)
-            body.append(
-                box("shelf", cell_x, (at - wall / 3, at + wall / 3), (inner_z[0], inner_z[1] - 0.06 * depth))
-            )
+            body.append(box("shelf", cell_x, (at - wall / 3, at + wall / 3), (inner_z[0], inner_z[1] - 0.06 * depth)))
         free = {"left": i == 0, "right": i == len(carcass.columns) - 1}
         for part_x, side in _leaves(cell, px, gap):
             swing = carcass.free_swing if free.get(side) else (1.25, np.pi / 2)
@@ -189,9 +185,7 @@ def _controls(rng: np.random.Generator, x: Range, y: Range, z: Range) -> list[Pi
     for k in range(count):
         share = (k + 1) / (count + 1)
         cx, cy = (
-            (x[0] + share * width, (y[0] + y[1]) / 2)
-            if width > height
-            else ((x[0] + x[1]) / 2, y[0] + share * height)
+            (x[0] + share * width, (y[0] + y[1]) / 2) if width > height else ((x[0] + x[1]) / 2, y[0] + share * height)
         )
         if knob:
             pieces.append(rod("knob", (cx, cy, z[0]), (cx, cy, z[1] + stand), size))
@@ -225,9 +219,7 @@ def _stand(carcass: Carcass, x: Range, z: Range) -> list[Piece]:
     return pieces
 
 
-def draw_front(
-    rng: np.random.Generator, thickness: Range, bare: float = 0.12, framed: float = 0.4
-) -> FrontStyle:
+def draw_front(rng: np.random.Generator, thickness: Range, bare: float = 0.12, framed: float = 0.4) -> FrontStyle:
     """A random front style; panels have a frame with probability `framed`."""
     rail = rng.uniform(0.03, 0.07) if rng.random() < framed else 0.0
     return FrontStyle(draw_handle(rng, bare), rng.uniform(*thickness), rail, rng.uniform(0.2, 0.45))
@@ -242,9 +234,7 @@ def _suited(rng: np.random.Generator, cell: Cell, width: float, height: float) -
     return cell
 
 
-def _storage_column(
-    rng: np.random.Generator, most: int, budget: int, leaf: float, outward: float
-) -> list[Cell]:
+def _storage_column(rng: np.random.Generator, most: int, budget: int, leaf: float, outward: float) -> list[Cell]:
     """At most `most` cells with at most `budget` movable parts.
 
     `leaf` is the column's width (m), `outward` the chance that a single door is hinged on the left.
@@ -307,9 +297,7 @@ def table(rng: np.random.Generator) -> ObjectSpec:
     columns = []
     for _ in range(int(rng.integers(1, 4))):
         rows = int(rng.choice([1, 2], p=[0.75, 0.25]))
-        columns.append(
-            Column([Cell("drawer", rng.uniform(0.8, 1.2)) for _ in range(rows)], rng.uniform(0.8, 1.25))
-        )
+        columns.append(Column([Cell("drawer", rng.uniform(0.8, 1.2)) for _ in range(rows)], rng.uniform(0.8, 1.25)))
     body, parts = build(
         rng,
         Carcass(
@@ -376,9 +364,7 @@ def microwave(rng: np.random.Generator) -> ObjectSpec:
             size=size,
             wall=rng.uniform(0.03, 0.06),
             columns=columns[::-1] if mirrored else columns,
-            style=FrontStyle(
-                handle, rng.uniform(0.035, 0.075), rng.uniform(0.08, 0.13), rng.uniform(0.2, 0.45)
-            ),
+            style=FrontStyle(handle, rng.uniform(0.035, 0.075), rng.uniform(0.08, 0.13), rng.uniform(0.2, 0.45)),
             clearance=rng.uniform(0.0045, 0.006),
             legs=rng.uniform(0.015, 0.04),
             leg_kind="rods",
@@ -414,9 +400,7 @@ def safe(rng: np.random.Generator) -> ObjectSpec:
 
 def _with_dial(rng: np.random.Generator, door: Part) -> Part:
     """The door with a dial fixed on its middle."""
-    points = np.concatenate(
-        [piece.vertices for piece in door.pieces if piece.name.startswith("door_surface")]
-    )
+    points = np.concatenate([piece.vertices for piece in door.pieces if piece.name.startswith("door_surface")])
     (x0, y0, z0), (x1, y1, z1) = points.min(0), points.max(0)
     cx, cy = (x0 + x1) / 2, y0 + rng.uniform(0.4, 0.75) * (y1 - y0)
     dial = rod(
@@ -442,9 +426,7 @@ def oven(rng: np.random.Generator) -> ObjectSpec:
             size=size,
             wall=rng.uniform(0.03, 0.05),
             columns=[Column(cells)],
-            style=FrontStyle(
-                handle, rng.uniform(0.035, 0.06), rng.uniform(0.07, 0.12), rng.uniform(0.2, 0.45)
-            ),
+            style=FrontStyle(handle, rng.uniform(0.035, 0.06), rng.uniform(0.07, 0.12), rng.uniform(0.2, 0.45)),
             clearance=rng.uniform(0.0045, 0.006),
             legs=rng.uniform(0.02, 0.08) if rng.random() < 0.6 else 0.0,
             leg_kind="plinth" if rng.random() < 0.5 else "rods",

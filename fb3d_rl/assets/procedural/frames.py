@@ -133,9 +133,7 @@ def washing_machine(rng: np.random.Generator) -> ObjectSpec:
         box("front_panel", (cx - hole, cx + hole), (cy + hole, height), front),
     ]
     knob = (x[0] + rng.uniform(0.2, 0.8) * width, height - controls / 2)
-    body.append(
-        rod("knob", (*knob, front[0]), (*knob, z[1] + rng.uniform(0.01, 0.03)), 0.25 * controls, sides=16)
-    )
+    body.append(rod("knob", (*knob, front[0]), (*knob, z[1] + rng.uniform(0.01, 0.03)), 0.25 * controls, sides=16))
     near = z[1] + rng.uniform(0.0045, 0.006)
     thickness = rng.uniform(0.03, 0.07)
     far = near + thickness
@@ -163,7 +161,5 @@ def washing_machine(rng: np.random.Generator) -> ObjectSpec:
         )
     )
     axis: Vector = (0, -sign, 0)
-    door_part = Part(
-        "door", "hinge", axis, rng.uniform(1.4, 2.2), tuple(pieces), (cx - sign * radius, cy, far)
-    )
+    door_part = Part("door", "hinge", axis, rng.uniform(1.4, 2.2), tuple(pieces), (cx - sign * radius, cy, far))
     return ObjectSpec("WashingMachine", "static", "washing_machine_body", tuple(body), (door_part,))

@@ -140,13 +140,8 @@ def handle(style: HandleStyle, x: Range, y: Range, z: Range, edge: Side | None) 
         ]
     feet = (low_end + thickness, high_end - thickness)
     if style.round:
-        posts = [
-            rod("handle", at(a, middle_across, root), at(a, middle_across, tip - half), 0.8 * half)
-            for a in feet
-        ]
-        bar = rod(
-            "handle", at(low_end, middle_across, tip - half), at(high_end, middle_across, tip - half), half
-        )
+        posts = [rod("handle", at(a, middle_across, root), at(a, middle_across, tip - half), 0.8 * half) for a in feet]
+        bar = rod("handle", at(low_end, middle_across, tip - half), at(high_end, middle_across, tip - half), half)
     else:
         strip = (middle_across - half, middle_across + half)
         posts = [place("handle", (a - half, a + half), strip, (root, tip - thickness)) for a in feet]

@@ -38,9 +38,7 @@ def kitchen_pot(rng: np.random.Generator) -> ObjectSpec:
                 # Starts at the wall's material where the wall curves away from the handle.
                 start = sign * float(np.sqrt(beside**2 - z**2))
                 body.append(rod("handle", (start, high, z), (tip, high, z), grip / 2))
-            body.append(
-                rod("handle", (tip, high, -spread - grip / 2), (tip, high, spread + grip / 2), grip / 2)
-            )
+            body.append(rod("handle", (tip, high, -spread - grip / 2), (tip, high, spread + grip / 2), grip / 2))
     elif kind == "long":
         sign = 1.0 if rng.random() < 0.5 else -1.0
         tip = sign * (radius + reach)
@@ -127,9 +125,7 @@ def trash_can(rng: np.random.Generator) -> ObjectSpec:
     ]
     if rng.random() < 0.5:
         pedal = rng.uniform(0.06, 0.12)
-        body.append(
-            box("pedal", (-pedal, pedal), (0.01, 0.035), (0.5 * foot[1], half[1] + rng.uniform(0.03, 0.1)))
-        )
+        body.append(box("pedal", (-pedal, pedal), (0.01, 0.035), (0.5 * foot[1], half[1] + rng.uniform(0.03, 0.1))))
     thick = rng.uniform(0.02, 0.05)
     top = height - base - thick
     lid = [slab("lid_surface", outline, (base, base + thick), half, half)]
@@ -208,9 +204,7 @@ def storage_box(rng: np.random.Generator) -> ObjectSpec:
                     rng.uniform(0.02, 0.04),
                 )
             )
-        parts = [
-            Part("rotation_lid", "hinge", (-1, 0, 0), rng.uniform(1.3, 2.1), tuple(pieces), (0.0, base, z[0]))
-        ]
+        parts = [Part("rotation_lid", "hinge", (-1, 0, 0), rng.uniform(1.3, 2.1), tuple(pieces), (0.0, base, z[0]))]
     else:
         # Each flap's inner upper edge stays within its closed length, since the hinge lies at its lower edge.
         gap = 2 * clearance
@@ -228,9 +222,7 @@ def storage_box(rng: np.random.Generator) -> ObjectSpec:
                 (x, (cut + gap, z[1]), (1, 0, 0), (0.0, base, z[1])),
             ]
         parts = [
-            Part(
-                "rotation_lid", "hinge", axis, rng.uniform(1.4, 2.2), (box("lid_surface", fx, y, fz),), origin
-            )
+            Part("rotation_lid", "hinge", axis, rng.uniform(1.4, 2.2), (box("lid_surface", fx, y, fz),), origin)
             for fx, fz, axis, origin in flaps
         ]
     return ObjectSpec("Box", "free", "box_body", tuple(body), tuple(parts))
@@ -255,9 +247,7 @@ def bucket(rng: np.random.Generator) -> ObjectSpec:
     angle = np.pi * np.arange(segments + 1) / segments
     corners = [(float(bail * np.cos(a)), pivot, float(side * bail * np.sin(a))) for a in angle]
     handle = [rod("handle", a, b, wire, sides=8) for a, b in zip(corners, corners[1:], strict=False)]
-    parts = (
-        Part("handle", "hinge", (-side, 0, 0), rng.uniform(1.25, 2.2), tuple(handle), (0.0, pivot, 0.0)),
-    )
+    parts = (Part("handle", "hinge", (-side, 0, 0), rng.uniform(1.25, 2.2), tuple(handle), (0.0, pivot, 0.0)),)
     return ObjectSpec("Bucket", "free", "bucket_body", tuple(body), parts)
 
 
@@ -274,9 +264,7 @@ def laptop(rng: np.random.Generator) -> ObjectSpec:
     pitch = (rows_to - rows_from) / rows
     for i in range(rows):
         start = rows_from + i * pitch
-        body.append(
-            box("keyboard", (x[0] + margin, x[1] - margin), (base, base + key), (start, start + 0.8 * pitch))
-        )
+        body.append(box("keyboard", (x[0] + margin, x[1] - margin), (base, base + key), (start, start + 0.8 * pitch)))
     bottom = base + key + clearance
     y = (bottom, bottom + screen)
     bezel = rng.uniform(0.03, 0.07)

@@ -1,0 +1,88 @@
+"""Trials through the collector: every scheduled trial ends in one row, whatever happens."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from fb3d_rl.assets import procedural
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.evaluation.rollout import run_trials
+from fb3d_rl.evaluation.trials import Scheduled, schedule
+from fb3d_rl.policies.flow_policy import VelocityLimits, expert_policy
+
+CAMERA = CameraOptions(resolution=48)
+OPTIONS = EnvOptions(points=300, camera=CAMERA, horizon=150)
+LIMITS = VelocityLimits(OPTIONS.gripper.v_max, OPTIONS.gripper.w_max)
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> list[ArticulatedObject]:
+    out: Path = tmp_path_factory.mktemp("objects")
+    return [load_object(out / name) for name in procedural.generate(out, ["Microwave", "KitchenPot"], 2, 3)]
+
+
+@pytest.fixture(scope="module")
+def trials(objects: list[ArticulatedObject]) -> list[Scheduled]:
+    return schedule([(obj, "train_test") for obj in objects], SampleOptions(points=300, camera=CAMERA), seed=0)[0]
+
+
+class Policy(TensorDictModuleBase):
+    """Calls ``act`` with the number of its call."""
+
+    def __init__(self, act: Callable[[int], torch.Tensor]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = [("observation", "qpos")], ["action"]
+        self.act, self.calls = act, 0
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        self.calls += 1
+        td["action"] = self.act(self.calls)[None]
+        return td
+
+
+def test_the_expert_opens_and_repeats_bit_for_bit(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
+    rows = run_trials("expert", expert_policy(LIMITS), objects, trials, OPTIONS)
+    assert [row.trial for row in rows] == list(range(len(trials)))
+    assert [(row.object, row.link) for row in rows] == [(t.trial.object, t.link) for t in trials]
+    assert sum(row.success for row in rows) >= len(rows) - 1
+    for row in rows:
+        assert row.status == "ok" and (row.failure == "") == row.success
+        assert row.success == (row.normalized_distance < OPTIONS.success)
+        assert 0 <= row.attach_step < row.steps <= OPTIONS.horizon
+    again = run_trials("expert", expert_policy(LIMITS), objects, trials[::-1], OPTIONS)
+    outcome = [(row.object, row.link, row.steps, row.normalized_distance, row.attach_step) for row in rows]
+    assert [(r.object, r.link, r.steps, r.normalized_distance, r.attach_step) for r in again[::-1]] == outcome, (
+        "a trial depends on neither its neighbours nor its place"
+    )
+
+
+def test_a_policy_that_stands_still_opens_nothing(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
+    options = EnvOptions(points=300, camera=CAMERA, horizon=5)
+    rows = run_trials("still", Policy(lambda call: torch.zeros(8)), objects, trials, options)
+    for row in rows:
+        assert (row.steps, row.contact, row.success, row.attach_step) == (5, False, False, -1)
+        assert row.normalized_distance == pytest.approx(1.0, abs=1e-3)
+        assert row.failure == "never touched the part"
+
+
+def test_a_crash_costs_its_own_trial_only(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
+    def act(call: int) -> torch.Tensor:
+        if call == 8:  # in the second trial
+            raise RuntimeError("the network fell over")
+        return torch.zeros(8)
+
+    options = EnvOptions(points=300, camera=CAMERA, horizon=5)
+    rows = run_trials("broken", Policy(act), objects, trials, options)
+    assert len(rows) == len(trials)
+    assert [row.status for row in rows] == ["ok", "error", *["ok"] * (len(trials) - 2)]
+    assert "the network fell over" in rows[1].error and rows[1].normalized_distance == 1.0

@@ -1,0 +1,83 @@
+"""The contact-point heuristic (supplement, I.E)."""
+
+from __future__ import annotations
+
+import torch
+
+from fb3d_rl.perception.contact import ContactOptions, choose_contact
+
+
+def plate(n: int = 25) -> torch.Tensor:
+    """A plate [1, n * n, 3] in the plane x = 0, 1 m wide."""
+    y, z = torch.meshgrid(torch.linspace(-0.5, 0.5, n), torch.linspace(0.5, 1.5, n), indexing="ij")
+    return torch.stack([torch.zeros_like(y), y, z], -1).reshape(1, -1, 3)
+
+
+def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None = None, **options: float):  # type: ignore[no-untyped-def]
+    valid = torch.ones(points.shape[:2], dtype=torch.bool)
+    nobody = torch.zeros_like(valid)
+    camera = torch.tensor([[-3.0, 0.0, 1.0]])
+    return choose_contact(points, valid, flow, camera, nobody if avoid is None else avoid, ContactOptions(**options))
+
+
+def hinge_flow(points: torch.Tensor) -> torch.Tensor:
+    """A plate hinged at y = 0.5 that opens towards -x: flow [1, N, 3] with largest norm 1."""
+    return torch.stack([points[..., 1] - 0.5, torch.zeros_like(points[..., 1]), torch.zeros_like(points[..., 1])], -1)
+
+
+def test_takes_a_large_flow_but_not_the_rim() -> None:
+    points = plate()
+    contact, direction, standoff = choose(points, hinge_flow(points))
+    assert -0.5 < contact[0, 1] < -0.25, "far from the hinge, and not on the edge at -0.5"
+    assert 0.5 < contact[0, 2] < 1.5
+    assert torch.allclose(direction[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
+    assert torch.equal(direction, standoff)
+
+
+def test_a_rough_spot_is_left_for_a_flat_one_at_least_2_cm_away() -> None:
+    points = plate()
+    rough = points[..., 1] < -0.2
+    bumps = torch.rand(points.shape[:2], generator=torch.Generator().manual_seed(0))
+    points[..., 0] = torch.where(rough, -0.1 * bumps, points[..., 0])
+    contact, _, _ = choose(points, hinge_flow(points), min_flow=0.3)
+    assert contact[0, 1] >= -0.25
+
+
+def test_does_not_choose_what_the_hand_cannot_reach() -> None:
+    points = plate()
+    shelf = points[points[..., 1] < 0.1].clone() - torch.tensor([0.2, 0.0, 0.0])  # a board in front of the outer part
+    cloud = torch.cat([points, shelf[None]], dim=1)
+    flow = torch.cat([hinge_flow(points), torch.zeros(1, len(shelf), 3)], dim=1)
+    contact, _, _ = choose(cloud, flow, min_flow=0.1)
+    assert contact[0, 1] > 0.1
+
+
+def test_avoids_points_tried_before() -> None:
+    points = plate()
+    flow = hinge_flow(points)
+    first, _, _ = choose(points, flow)
+    avoid = (points - first[:, None]).norm(dim=-1) < 0.2
+    second, _, _ = choose(points, flow, avoid)
+    assert (first - second).norm() >= 0.2
+
+
+def test_a_sash_that_slides_in_its_plane_is_touched_along_its_normal() -> None:
+    points = plate()
+    flow = torch.tensor([0.0, 1.0, 0.0]).expand_as(points).clone()
+    _, direction, standoff = choose(points, flow)
+    assert torch.allclose(direction[0], torch.tensor([0.0, 1.0, 0.0]), atol=1e-5)
+    assert torch.allclose(standoff[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-3), "towards the camera's side"
+
+
+def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
+    points = plate()
+    for value in choose(points, torch.zeros_like(points)):
+        assert torch.equal(value, torch.zeros_like(value))
+    valid = torch.ones(points.shape[:2], dtype=torch.bool)
+    valid[:, :300] = False
+    flow = hinge_flow(points)
+    flow[:, :300] *= 100.0
+    contact, _, _ = choose_contact(
+        points, valid, flow, torch.tensor([[-3.0, 0.0, 1.0]]), torch.zeros_like(valid), ContactOptions(min_flow=0.0)
+    )
+    assert not (points[0, :300] == contact[0]).all(-1).any()

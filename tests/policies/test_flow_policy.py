@@ -1,0 +1,204 @@
+"""The flow policy in a toy world without physics: a hand that moves exactly as commanded and a door on a hinge."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from fb3d_rl.contract import ACTION_DIM
+from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.flow_policy import (
+    APPROACH,
+    PULL,
+    RETREAT,
+    SELECT,
+    FlowPolicy,
+    FlowPolicyOptions,
+    VelocityLimits,
+    artflownet_policy,
+    expert_policy,
+)
+
+LIMITS = VelocityLimits(linear=2.0, angular=3.0)
+DT = 0.05
+TOOL = torch.tensor([0.12, 0.0, 0.0])
+
+
+class ToyDoor:
+    """A door in the plane x = 0 that turns about the z axis through (0, 0.4) and opens towards -x; units m, rad."""
+
+    def __init__(self, sliding: bool = False) -> None:
+        y, z = torch.meshgrid(torch.linspace(-0.39, 0.39, 20), torch.linspace(0.3, 1.1, 20), indexing="ij")
+        self.grid = torch.stack([torch.zeros_like(y), y, z], -1).reshape(-1, 3)
+        self.sliding, self.opened = sliding, 0.0
+        self.qpos = torch.tensor([[-1.2, 0.0, 0.7, 0, 0, 0, 0, 0]])
+        self.held: Tensor | None = None
+
+    def points(self) -> Tensor:
+        if self.sliding:
+            return self.grid - torch.tensor([self.opened, 0.0, 0.0])
+        arm = self.grid[:, 1] - 0.4  # negative: the door's points lie at y < 0.4
+        x, y = arm * math.sin(self.opened), 0.4 + arm * math.cos(self.opened)
+        return torch.stack([x, y, self.grid[:, 2]], -1)
+
+    def flow(self) -> Tensor:
+        if self.sliding:
+            return torch.tensor([-1.0, 0.0, 0.0]).expand(len(self.grid), 3)
+        arm = self.grid[:, 1] - 0.4
+        moved = torch.stack([arm * math.cos(self.opened), -arm * math.sin(self.opened), torch.zeros_like(arm)], -1)
+        return moved / moved.norm(dim=-1).max()
+
+    def tip(self) -> Tensor:
+        return self.qpos[:, :3] + (euler_xyz_to_matrix(self.qpos[:, 3:6]) @ TOOL[:, None])[..., 0]
+
+    def observe(self, state: TensorDict) -> TensorDict:
+        n = len(self.grid)
+        rotation = euler_xyz_to_matrix(self.qpos[:, 3:6])
+        return TensorDict(
+            {
+                "observation": {
+                    "points": self.points()[None],
+                    "valid": torch.ones(1, n, dtype=torch.bool),
+                    "part_mask": torch.ones(1, n, dtype=torch.bool),
+                    "qpos": self.qpos,
+                    "qvel": torch.zeros(1, 8),
+                    "tool_pose": torch.cat([self.tip(), matrix_to_quaternion(rotation)], -1),
+                    "attached": torch.tensor([[self.held is not None]]),
+                    "contact_force": torch.zeros(1, 1),
+                    "camera_position": torch.tensor([[-3.0, 0.0, 1.0]]),
+                },
+                "privileged": {"flow": self.flow()[None]},
+                "policy": state,
+            },
+            batch_size=[1],
+        )
+
+    def step(self, action: Tensor) -> None:
+        scale = torch.tensor([LIMITS.linear] * 3 + [LIMITS.angular] * 3 + [0.0] * 2)
+        self.qpos = self.qpos + DT * action * scale
+        tip = self.tip()[0]
+        if self.held is None:
+            distance = (self.points() - tip).norm(dim=-1)
+            if distance.min() < 0.05 and tip[0] > self.points()[distance.argmin(), 0] - 0.01:
+                self.held = distance.argmin()
+        elif self.sliding:
+            self.opened = max(0.0, -float(tip[0]))
+        else:
+            self.opened = math.atan2(-float(tip[0]), 0.4 - float(tip[1]))
+
+
+def rollout(door: ToyDoor, policy: FlowPolicy, until: float) -> list[int]:
+    state, phases = policy.initial_state((1,)), []
+    while door.opened < until and len(phases) < 150:
+        td = policy(door.observe(state))
+        state = td["next", "policy"]
+        phases.append(int(state["phase"]))
+        assert td["action"].shape == (1, ACTION_DIM)
+        assert td["action"].abs().max() <= 1.0 + 1e-6
+        assert torch.equal(td["action"][:, 6:], torch.zeros(1, 2)), "the fingers stay closed (supplement, II.C)"
+        door.step(td["action"])
+    return phases
+
+
+def test_opens_a_hinged_door_and_turns_with_it() -> None:
+    door = ToyDoor()
+    phases = rollout(door, expert_policy(LIMITS), until=1.4)
+    assert phases[-1] == PULL and APPROACH in phases
+    assert door.opened >= 1.4 and len(phases) < 150
+    away = -euler_xyz_to_matrix(door.qpos[:, 3:6])[0, :, 0]  # from the tip to the hand
+    normal = torch.tensor([-math.cos(door.opened), math.sin(door.opened), 0.0])
+    assert away @ normal > 0.95, "the hand keeps standing on the door as it did at contact"
+
+
+def test_opens_a_drawer_straight() -> None:
+    door = ToyDoor(sliding=True)
+    rollout(door, expert_policy(LIMITS), until=0.5)
+    assert door.opened >= 0.5
+    assert abs(float(door.tip()[0, 1] - door.points()[door.held, 1])) < 0.06
+
+
+def test_touches_where_the_lever_is_long() -> None:
+    policy = expert_policy(LIMITS)
+    td = policy(ToyDoor().observe(policy.initial_state((1,))))
+    contact = td["next", "policy", "contact_point"][0]
+    assert contact[1] < 0.0, "the hinge is at y = 0.4"
+    assert torch.allclose(td["next", "policy", "standoff"][0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-4)
+
+
+def test_a_guarded_approach_that_does_not_hold_is_given_up_and_another_point_is_tried() -> None:
+    options = FlowPolicyOptions(patience=1)
+    policy, door = expert_policy(LIMITS, options), ToyDoor()
+    state = policy.initial_state((1,))
+    points, phases = [], []
+    for _ in range(120):
+        td = door.observe(state)
+        pressing = int(state["phase"]) == APPROACH and door.tip()[0, 0] > -0.02
+        td["observation", "contact_force"] = torch.tensor([[100.0 if pressing else 0.0]])
+        td = policy(td)
+        state = td["next", "policy"]
+        phases.append(int(state["phase"]))
+        points.append(tuple(state["contact_point"][0].tolist()))
+        door.qpos = door.qpos + DT * td["action"] * torch.tensor([2.0] * 3 + [3.0] * 3 + [0.0] * 2)
+    assert RETREAT in phases and int(state["tries"]) >= 1
+    first, second = list(dict.fromkeys(p for p in points if any(p)))[:2]
+    assert math.dist(first, second) >= options.retry_distance
+
+
+def test_without_flow_it_waits() -> None:
+    policy = expert_policy(LIMITS)
+    td = ToyDoor().observe(policy.initial_state((1,)))
+    td["privileged", "flow"] = torch.zeros_like(td["privileged", "flow"])
+    out = policy(td)
+    assert int(out["next", "policy", "phase"]) == SELECT
+    assert torch.allclose(out["action"], torch.zeros(1, 8), atol=1e-6)
+
+
+def test_environments_of_a_batch_do_not_mix() -> None:
+    policy = expert_policy(LIMITS)
+    near, far = ToyDoor(), ToyDoor(sliding=True)
+    far.qpos = far.qpos + torch.tensor([[-0.3, 0.2, 0.1, 0.2, -0.1, 0.3, 0, 0]])
+    singles = [door.observe(policy.initial_state((1,))) for door in (near, far)]
+    both = policy(torch.cat([td.clone() for td in singles]))
+    for i, td in enumerate(singles):
+        assert torch.allclose(both["action"][i], policy(td)["action"][0], atol=1e-5)
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.3, -0.4, 0.9), (-1.2, 0.7, 1.5)])
+def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, float]) -> None:
+    policy, door = expert_policy(LIMITS), ToyDoor()
+    door.qpos[:, 3:6] = torch.tensor(angles)
+    td = door.observe(policy.initial_state((1,)))
+    tip, hand = door.tip(), policy._hand_axis(td["observation", "tool_pose"])
+    velocity, angular = torch.tensor([[0.3, -0.2, 0.4]]), torch.tensor([[0.2, 0.3, -0.1]])
+    action = policy._joint_velocities(td["observation"], tip, hand, velocity, angular)
+    h = 1e-3
+    scale = torch.tensor([LIMITS.linear] * 3 + [LIMITS.angular] * 3 + [0.0] * 2)
+    door.qpos = door.qpos + h * action * scale
+    assert torch.allclose((door.tip() - tip) / h, velocity, atol=2e-3)
+    turned = -euler_xyz_to_matrix(door.qpos[:, 3:6])[..., 0]
+    assert torch.allclose((turned - hand) / h, torch.linalg.cross(angular, hand), atol=2e-2)
+
+
+def test_the_hand_is_kept_above_the_ground() -> None:
+    policy = expert_policy(LIMITS, replace(FlowPolicyOptions(), clearance=0.08, hand_length=0.2))
+    down, tip = torch.tensor([[-0.1, 0.0, -0.995]]), torch.tensor([[0.0, 0.0, 0.1]])
+    lifted = policy._above_ground(down, tip)
+    assert lifted.norm().isclose(torch.tensor(1.0), atol=1e-3)
+    assert tip[0, 2] + 0.2 * lifted[0, 2] >= 0.08 - 1e-6
+    assert torch.equal(policy._above_ground(-down, tip), -down)
+
+
+def test_flowbot3d_sees_nothing_privileged_and_the_expert_differs_by_its_flow_alone() -> None:
+    learned = artflownet_policy(ArtFlowNet(neighbors=8, generator=torch.Generator().manual_seed(0)), LIMITS)
+    assert not [key for key in learned.in_keys if "privileged" in key]
+    door = ToyDoor()
+    td = door.observe(FlowPolicy.initial_state((1,)))
+    td["prediction", "flow"] = td["privileged", "flow"]
+    same = FlowPolicy(("prediction", "flow"), LIMITS)(td.clone())["action"]
+    assert torch.equal(same, expert_policy(LIMITS)(td)["action"])

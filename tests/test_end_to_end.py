@@ -1,0 +1,105 @@
+"""The main job in small: objects, samples, fit, trials, report; twice with the same seed, and once resumed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from fb3d_rl.algos.artflownet import run, run_evaluation
+from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.evaluation.rows import read_trials
+from fb3d_rl.training.run_log import RunLog, read_rows
+
+CONF = str(Path(__file__).parents[1] / "conf")
+SMALL = [
+    "experiment=smoke",
+    "assets.categories=[Microwave,KitchenPot]",
+    "algo.steps=6",
+    "algo.batch_size=4",
+    "algo.neighbors=16",
+    "algo.log_every=2",
+    "algo.evaluate_every=3",
+    "algo.checkpoint_every=3",
+    "data.points=256",
+    "data.train_samples=24",
+    "data.workers=0",
+    "camera.resolution=48",
+    "evaluation.trials=2",
+    "env.horizon=70",
+]
+
+
+def config(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
+    store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
+    store.store(name=f"{name}_schema", node=schema)
+    with initialize_config_dir(CONF, version_base="1.3"):
+        cfg = OmegaConf.to_object(compose(name, overrides))
+    validate(cfg)
+    return cfg
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("first")
+    run(config("train", SMALL), out)
+    return out
+
+
+def test_a_run_leaves_what_it_promises(first: Path) -> None:
+    names = {path.name for path in first.iterdir()}
+    assert names >= {"metrics.jsonl", "checkpoint.pt", "rows.csv", "flow_rows.csv", "summary.json", "report.html",
+                     "flow.png", "clouds.npz"}  # fmt: skip
+    assert not [name for name in names if name.endswith((".part", ".tmp"))]
+    summary = json.loads((first / "summary.json").read_text())
+    for key in ("flow/cosine", "flow/rmse", "flow/magnitude_error", "success_rate", "normalized_distance",
+                "contact_rate", "expert/success_rate", "by_category", "n", "seed", "git_revision"):  # fmt: skip
+        assert key in summary, key
+    rows = read_trials(first / "rows.csv")
+    assert [row.policy for row in rows] == ["expert"] * 2 + ["artflownet"] * 2
+    assert all(row.contact for row in rows if row.policy == "expert")
+    assert "nan" not in (first / "metrics.jsonl").read_text().lower()
+
+
+def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path) -> None:
+    run(config("train", SMALL), tmp_path)
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
+    for name in ("rows.csv", "flow_rows.csv"):
+        assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_another_seed_gives_other_objects_and_weights(first: Path, tmp_path: Path) -> None:
+    run(config("train", [*SMALL, "seed=1"]), tmp_path)
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) != read_rows(first / "metrics.jsonl", times=False)
+
+
+@pytest.mark.slow
+def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path) -> None:
+    # The learning rate's cycle depends on the number of steps, so a shorter run would not do: this one is cut.
+    write = RunLog.write
+
+    def stop_at_four(log: RunLog, row: dict[str, object]) -> None:
+        if row["step"] == 4:
+            raise KeyboardInterrupt
+        write(log, row)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RunLog, "write", stop_at_four)
+        with pytest.raises(KeyboardInterrupt):
+            run(config("train", SMALL), tmp_path)
+    run(config("train", [*SMALL, "resume=true"]), tmp_path)
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
+    assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path) -> None:
+    same = [item for item in SMALL if not item.startswith(("algo.", "data.train_samples"))]
+    run_evaluation(config("evaluate", [*same, "policy=artflownet", f"checkpoint={first / 'checkpoint.pt'}"]), tmp_path)
+    assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+    assert (tmp_path / "flow_rows.csv").read_bytes() == (first / "flow_rows.csv").read_bytes()
