@@ -310,9 +310,9 @@ def _table(numbers: Mapping[str, Any], names: Sequence[str], flow: bool) -> Tabl
         table.add_section()
     for label, suffix in (("class mean", "_class_mean"), ("instance mean", "")):
         add(label, numbers, suffix)
-        add("  95 % interval", numbers, suffix, interval=True)
-    outer = Table(title="Results on held-out objects", box=None, padding=(0, 3, 0, 0), pad_edge=False)
-    outer.add_column("")
+        add("95 % interval", numbers, suffix, interval=True)
+    outer = Table(title="Results on held-out objects", box=None, padding=(0, 2, 0, 0), pad_edge=False)
+    outer.add_column("", no_wrap=True, min_width=13)
     for name, _, _ in groups:
         outer.add_column(name, justify="left", no_wrap=True)
     outer.add_row(labels, *inner)

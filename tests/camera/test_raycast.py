@@ -1,0 +1,212 @@
+"""The ray-casting camera, on shapes whose picture is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
+from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
+from fb3d_rl.camera.views import View
+from fb3d_rl.flow.kinematics import KinematicTree
+from fb3d_rl.flow.opening import opening_range, standing_pose
+
+OPTIONS = CameraOptions(resolution=33)
+FRONT = View(0.0, 0.0)
+
+
+def mesh_of(made: trimesh.Trimesh, at: Sequence[float] = (0, 0, 0)) -> Mesh:
+    return Mesh(np.array(made.vertices) + np.array(at, dtype=float), np.array(made.faces, dtype=np.int64))
+
+
+def box(extents: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> Mesh:
+    return mesh_of(trimesh.creation.box(extents=extents), at)
+
+
+def rigid_object(*meshes: Sequence[Mesh]) -> ArticulatedObject:
+    """An object of fixed links, one for each list of meshes."""
+    links = [
+        Link(f"l{i}", "", i - 1, None if i == 0 else Joint("j", "fixed", np.eye(4), np.zeros(3), (0, 0)), tuple(m), ())
+        for i, m in enumerate(meshes)
+    ]
+    return ArticulatedObject("made", "Test", Path("none"), tuple(links))
+
+
+def drawer() -> ArticulatedObject:
+    """A body of 1 m with a front of a drawer before it, which slides out along -x."""
+    slide = Joint("j", "prismatic", np.eye(4), np.array([-1.0, 0, 0]), (0.0, 0.5))
+    links = (
+        Link("body", "", -1, None, (box((1, 1, 1), (0, 0, 0.5)),), ()),
+        Link("drawer", "drawer", 0, slide, (box((0.1, 0.8, 0.4), (-0.55, 0, 0.5)),), ()),
+    )
+    return ArticulatedObject("made", "Test", Path("none"), links)
+
+
+def still(count: int, *poses: np.ndarray) -> np.ndarray:
+    return np.stack([np.eye(4)] * count + list(poses))
+
+
+def local(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+@pytest.mark.parametrize("view", [FRONT, View(40.0, 35.0), View(-120.0, 70.0), View(10.0, -20.0)])
+def test_points_lie_on_the_surface_of_a_box_and_on_its_visible_side(view: View) -> None:
+    half = np.array([0.3, 0.5, 0.2])
+    obj = rigid_object([box(2 * half)])
+    camera = RaycastCamera(obj, options=OPTIONS)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", [0.4, -0.2, 0.9]).as_matrix(), camera.centre + 0.05
+    points, links = camera.capture(pose[None], view)
+    assert len(points) > 150 and (links == 0).all()
+    inside = np.abs(local(points, pose)) / half
+    depth = np.abs(local(points, pose)) - half
+    np.testing.assert_allclose(depth.max(-1), 0.0, atol=1e-4)
+    # The face that a point lies on faces the camera.
+    eye = local(camera.pose(view)[:3, 3], pose)
+    face = inside.argmax(-1)
+    rows = np.arange(len(points))
+    side = np.sign(local(points, pose)[rows, face])
+    ends = np.sort(inside, axis=-1)
+    clear = ends[:, 2] - ends[:, 1] > 1e-3  # not on an edge
+    assert (side[clear] * eye[face[clear]] > half[face[clear]]).all()
+
+
+def test_points_lie_on_the_near_side_of_a_sphere() -> None:
+    obj = rigid_object([mesh_of(trimesh.creation.icosphere(subdivisions=5, radius=0.5))])
+    camera = RaycastCamera(obj, options=OPTIONS)
+    centre = np.array([0.0, 0.0, 0.5])
+    np.testing.assert_allclose(camera.centre, centre, atol=1e-3)
+    for view in (FRONT, View(70.0, 20.0)):
+        poses = still(1)
+        poses[0, :3, 3] = centre
+        points, _ = camera.capture(poses, view)
+        np.testing.assert_allclose(np.linalg.norm(points - centre, axis=-1), 0.5, atol=1e-3)  # the facets' height
+        assert (((points - centre) * (camera.pose(view)[:3, 3] - points)).sum(-1) > -1e-3).all()
+        share = len(points) / OPTIONS.resolution**2
+        radius = np.tan(np.arcsin(0.5 / camera.distance)) / np.tan(np.radians(OPTIONS.fov / 2))
+        assert share == pytest.approx(np.pi * radius**2 / 4, rel=0.05)  # the disc that a sphere's outline makes
+
+
+def test_azimuth_and_elevation_choose_the_side_that_is_seen() -> None:
+    obj = rigid_object([box((1, 1, 1))])
+    camera = RaycastCamera(obj, options=OPTIONS)
+    poses = standing_pose(obj)[None]
+    for view, axis, value in (
+        (FRONT, 0, -0.5),
+        (View(90.0, 0.0), 1, -0.5),
+        (View(-90.0, 0.0), 1, 0.5),
+        (View(180.0, 0.0), 0, 0.5),
+        (View(0.0, 90.0), 2, 1.0),
+    ):
+        points, _ = camera.capture(poses, view)
+        np.testing.assert_allclose(points[:, axis], value, atol=1e-4)
+    above, _ = camera.capture(poses, View(0.0, 45.0))
+    assert (above[:, 2] > 1.0 - 1e-4).any() and (above[:, 0] < -0.5 + 1e-4).any()
+    assert not ((above[:, 0] > 0.5 - 1e-4) & (above[:, 2] < 1.0 - 1e-3)).any()
+
+
+@pytest.mark.parametrize("view", [FRONT, View(33.0, 21.0)])
+def test_the_centre_of_the_image_is_the_centre_of_the_object(view: View) -> None:
+    obj = rigid_object([box((0.2, 0.9, 0.6))])
+    camera = RaycastCamera(obj, options=OPTIONS)
+    points, _ = camera.capture(standing_pose(obj)[None], view)
+    pose = camera.pose(view)
+    seen = local(points, pose)
+    off_axis = np.linalg.norm(seen[:, :2], axis=-1)
+    assert off_axis.min() < 1e-6 and camera.distance - 1.0 < seen[off_axis.argmin(), 2] < camera.distance
+    # y down, z forward, rows from the top: the first points are the highest.
+    assert seen[0, 1] < 0 < seen[-1, 1] and points[0, 2] > points[-1, 2]
+
+
+def test_the_whole_closed_object_is_in_the_image_whatever_the_view() -> None:
+    obj = rigid_object([box((0.4, 2.0, 0.7))])
+    camera = RaycastCamera(obj, options=CameraOptions(resolution=33, margin=1.15))
+    slope = np.tan(np.radians(20.0))
+    for azimuth in range(0, 360, 45):
+        view = View(float(azimuth), 25.0)
+        corners = local(obj.links[0].visuals[0].vertices + standing_pose(obj)[:3, 3], camera.pose(view))
+        assert (np.abs(corners[:, :2]) < slope * corners[:, 2:]).all()
+
+
+def test_what_stands_in_front_hides_what_is_behind() -> None:
+    near, far = box((0.1, 1.2, 1.2), (-1, 0, 0.6)), box((0.1, 1, 1), (1, 0, 0.6))
+    camera = RaycastCamera(rigid_object([far], [near], []), options=OPTIONS)
+    for view, seen, x in ((FRONT, 1, -1.05), (View(180.0, 0.0), 0, 1.05)):
+        points, links = camera.capture(still(3), view)
+        assert set(links) == {seen}
+        np.testing.assert_allclose(points[:, 0], x, atol=1e-4)
+    aside = still(3)
+    aside[1, 1, 3] = 0.9  # the near plate, moved off, hides a part of the far one
+    points, links = camera.capture(aside, FRONT)
+    assert set(links) == {0, 1}
+    np.testing.assert_allclose(points[links == 0, 0], 0.95, atol=1e-4)
+    np.testing.assert_allclose(points[links == 1, 0], -1.05, atol=1e-4)
+    eye = camera.pose(FRONT)[:3, 3]
+    through = eye + (points[links == 0] - eye) * ((-1.05 - eye[0]) / (0.95 - eye[0]))
+    assert (through[:, 1] < 0.3 + 1e-3).all()  # the sight of no far point passes through the near plate
+    # The order of the links makes no difference.
+    swapped = RaycastCamera(rigid_object([near], [far], []), options=OPTIONS)
+    assert set(swapped.capture(still(3), FRONT)[1]) == {0}
+
+
+def test_further_bodies_are_numbered_on_and_hide_the_object() -> None:
+    obj = rigid_object([box((1, 1, 1), (0, 0, 0.5))])
+    camera = RaycastCamera(obj, bodies=[[], [box((0.02, 0.3, 0.3))]], options=OPTIONS)
+    before = np.eye(4)
+    before[:3, 3] = (-1.0, 0.0, 0.5)
+    points, links = camera.capture(still(2, before), FRONT)
+    assert set(links) == {0, 2}
+    np.testing.assert_allclose(points[links == 2, 0], -1.01, atol=1e-4)
+    on_object = points[links == 0]
+    hidden = np.abs(on_object[:, 1:] - [0, 0.5]).max(-1) < 0.15
+    assert not hidden.any()
+    before[0, 3] = 1.0  # behind the object
+    assert set(camera.capture(still(2, before), FRONT)[1]) == {0}
+
+
+def test_points_move_with_their_joint() -> None:
+    obj = drawer()
+    tree, camera = KinematicTree.from_object(obj), RaycastCamera(obj, options=OPTIONS)
+    for q in (0.0, 0.2, 0.5):
+        points, links = camera.capture(tree.forward(torch.tensor([q])).numpy(), FRONT)
+        assert set(links) == {0, 1}
+        np.testing.assert_allclose(points[links == 1, 0], -0.6 - q, atol=1e-4)
+        np.testing.assert_allclose(points[links == 0, 0], -0.5, atol=1e-4)
+
+
+def test_links_of_points_are_those_whose_surface_they_lie_on(procedural_objects: dict[str, ArticulatedObject]) -> None:
+    for obj in procedural_objects.values():
+        closed, opened = opening_range(obj)
+        tree = KinematicTree.from_object(obj)
+        qpos = torch.as_tensor(closed + 0.4 * (opened - closed))
+        poses = standing_pose(obj) @ tree.forward(qpos).numpy()
+        points, links = RaycastCamera(obj, options=OPTIONS).capture(poses, View(25.0, 35.0))
+        assert len(set(links)) >= 2
+        for link in set(links.tolist()):
+            triangles = np.concatenate([m.vertices[m.faces] for m in obj.links[link].visuals])
+            for point in local(points[links == link][::10], poses[link]):
+                nearest = trimesh.triangles.closest_point(triangles, np.tile(point, (len(triangles), 1)))
+                assert np.linalg.norm(nearest - point, axis=-1).min() < 1e-4
+
+
+def test_nothing_in_sight_is_an_empty_cloud() -> None:
+    camera = RaycastCamera(rigid_object([box((1, 1, 1))]), options=OPTIONS)
+    away = np.eye(4)
+    away[:3, 3] = (0.0, 0.0, 50.0)
+    points, links = camera.capture(away[None], FRONT)
+    assert points.shape == (0, 3) and links.shape == (0,)
+
+
+def test_pictures_repeat_bit_for_bit(procedural_objects: dict[str, ArticulatedObject]) -> None:
+    obj = procedural_objects["Microwave"]
+    poses = KinematicTree.from_object(obj).forward(torch.zeros(len(obj.movable))).numpy()
+    first, second = (RaycastCamera(obj, options=OPTIONS).capture(poses, View(13.0, 29.0)) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)

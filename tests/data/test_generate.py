@@ -1,0 +1,128 @@
+"""Sets of samples: the same whoever draws them, reused only if finished and made from the same recipe."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDictBase
+
+from fb3d_rl import contract
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.contract import UserError
+from fb3d_rl.data.generate import DONE, generate_samples
+from fb3d_rl.data.samples import SampleOptions
+
+OPTIONS = SampleOptions(points=256, camera=CameraOptions(resolution=32))
+COUNT = 11
+
+
+@pytest.fixture(scope="module")
+def folders(procedural_root: Path) -> list[Path]:
+    return sorted(procedural_root.iterdir())
+
+
+def draw(out: Path, folders: list[Path], seed: int = 0, options: SampleOptions = OPTIONS, workers: int = 0) -> TensorDictBase:
+    return generate_samples(out, folders, COUNT, seed, options, workers)
+
+
+def same(a: TensorDictBase, b: TensorDictBase) -> bool:
+    return bool((a.contiguous() == b.contiguous()).all())
+
+
+def test_rows_keep_the_contract_and_objects_take_turns(tmp_path: Path, folders: list[Path]) -> None:
+    calls: list[int] = []
+    rows = generate_samples(tmp_path / "s", folders, COUNT, 0, OPTIONS, 0, calls.append)
+    assert rows.batch_size == torch.Size([COUNT])
+    contract.check(rows, "sample")
+    counts = torch.bincount(rows["object"], minlength=len(folders))
+    assert counts.max() - counts.min() <= 1
+    assert calls == sorted(calls) and calls[-1] == COUNT
+    for row in rows:
+        norm = row["privileged", "flow"].norm(dim=-1)
+        assert norm.max() == pytest.approx(1.0, abs=1e-6)
+        assert torch.equal(row["observation", "part_mask"], norm > 1e-4)
+        links = load_object(folders[int(row["object"])]).links
+        assert int(row["target"]) == -1 or links[int(row["target"])].joint is not None
+
+
+def test_rows_follow_from_the_seed(tmp_path: Path, folders: list[Path]) -> None:
+    first, again = draw(tmp_path / "a", folders), draw(tmp_path / "b", folders)
+    other = draw(tmp_path / "c", folders, seed=1)
+    assert same(first, again)
+    assert not torch.equal(first["observation", "points"], other["observation", "points"])
+
+
+@pytest.mark.slow
+def test_workers_make_no_difference(tmp_path: Path, folders: list[Path]) -> None:
+    assert same(draw(tmp_path / "a", folders, workers=0), draw(tmp_path / "b", folders, workers=2))
+
+
+def test_a_finished_set_is_reused(tmp_path: Path, folders: list[Path]) -> None:
+    rows = draw(tmp_path / "s", folders)
+    rows["observation", "points"][0] = 42.0  # a mark in the file, which only a new drawing would remove
+    again = draw(tmp_path / "s", folders)
+    assert (again["observation", "points"][0] == 42.0).all()
+
+
+@pytest.mark.parametrize("change", ["points", "camera", "seed", "folders", "count"])
+def test_another_recipe_is_drawn_anew(tmp_path: Path, folders: list[Path], change: str) -> None:
+    out = tmp_path / "s"
+    draw(out, folders)["observation", "points"][:] = 42.0
+    options, seed, chosen, count = OPTIONS, 0, folders, COUNT
+    if change == "points":
+        options = dataclasses.replace(OPTIONS, points=200)
+    elif change == "camera":
+        options = dataclasses.replace(OPTIONS, camera=CameraOptions(resolution=24))
+    elif change == "seed":
+        seed = 1
+    elif change == "folders":
+        chosen = folders[:2]
+    else:
+        count = COUNT + 1
+    rows = generate_samples(out, chosen, count, seed, options, 0)
+    assert rows["observation", "points"].shape == (count, options.points, 3)
+    assert not (rows["observation", "points"] == 42.0).any()
+    assert same(rows, generate_samples(tmp_path / "fresh", chosen, count, seed, options, 0))
+
+
+def test_a_half_written_set_is_drawn_anew(tmp_path: Path, folders: list[Path]) -> None:
+    expected = draw(tmp_path / "whole", folders).clone()
+    rows = draw(tmp_path / "half", folders)
+    rows["observation", "points"][5:] = 0.0
+    (tmp_path / "half" / DONE).unlink()
+    assert same(draw(tmp_path / "half", folders), expected)
+    assert (tmp_path / "half" / DONE).is_file()
+
+
+@pytest.fixture
+def block(tmp_path: Path, folders: list[Path]) -> Path:
+    """An object whose joints are all fixed."""
+    folder = tmp_path / "block"
+    folder.mkdir()
+    shutil.copytree(folders[0] / "textured_objs", folder / "textured_objs")
+    urdf = (folders[0] / "mobility.urdf").read_text()
+    (folder / "mobility.urdf").write_text(urdf.replace('"revolute"', '"fixed"').replace('"prismatic"', '"fixed"'))
+    return folder
+
+
+def test_rows_of_objects_that_show_nothing_are_copies_of_others(tmp_path: Path, folders: list[Path], block: Path) -> None:
+    rows = draw(tmp_path / "s", [block, *folders[:1]])
+    contract.check(rows, "sample")
+    assert (rows["object"] == 1).all()
+    assert (rows["privileged", "flow"].norm(dim=-1).amax(-1) > 0.99).all()
+    distinct = {row["observation", "points"].numpy().tobytes() for row in rows}
+    assert len(distinct) == COUNT // 2
+    done = json.loads((tmp_path / "s" / DONE).read_text())
+    assert done["refilled"] == COUNT - COUNT // 2
+
+
+def test_nothing_to_open_is_refused_and_leaves_no_finished_set(tmp_path: Path, block: Path) -> None:
+    with pytest.raises(UserError, match="can be opened"):
+        draw(tmp_path / "s", [block])
+    assert not (tmp_path / "s" / DONE).exists()

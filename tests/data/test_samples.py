@@ -1,0 +1,113 @@
+"""One flow sample: its mask, flow, joint state and view agree with each other and follow from the generator alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from fb3d_rl import contract
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.views import View, ViewRange
+from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions, draw_sample
+
+CAMERA = CameraOptions(resolution=32)
+OPTIONS = SampleOptions(points=256, camera=CAMERA)
+
+
+@pytest.fixture(scope="module")
+def views(procedural_objects: dict[str, ArticulatedObject]) -> list[ObjectView]:
+    return [ObjectView(obj, CAMERA) for obj in procedural_objects.values()]
+
+
+@pytest.mark.parametrize("all_parts", [0.0, 1.0])
+def test_mask_is_where_the_flow_is(views: list[ObjectView], all_parts: float) -> None:
+    options = dataclasses.replace(OPTIONS, all_parts_share=all_parts)
+    for view in views:
+        for seed in range(5):
+            sample = draw_sample(view, options, np.random.default_rng(seed))
+            assert sample is not None
+            contract.check(sample, "sample")
+            norm = sample["privileged", "flow"].norm(dim=-1)
+            mask, valid = sample["observation", "part_mask"], sample["observation", "valid"]
+            # No point of these objects lies on a joint's axis to 1e-4 of the farthest one's radius.
+            assert torch.equal(mask, norm > 1e-4)
+            assert (norm[~mask] == 0).all() and not (mask & ~valid).any()
+            assert norm.max() == pytest.approx(1.0, abs=1e-6)
+            assert (sample["observation", "points"][~valid] == 0).all()
+            if all_parts:
+                assert sample["target"] == -1
+            else:
+                assert int(sample["target"]) in view.openable and int(mask.sum()) >= MIN_VISIBLE
+
+
+def test_padding_follows_the_points(views: list[ObjectView]) -> None:
+    sample = draw_sample(views[0], dataclasses.replace(OPTIONS, points=2000), np.random.default_rng(0))
+    assert sample is not None
+    valid = sample["observation", "valid"]
+    count = int(valid.sum())
+    assert MIN_VISIBLE < count < 1024 and valid[:count].all()
+    assert (sample["privileged", "flow"][~valid] == 0).all()
+    assert (sample["observation", "points"][valid][:, 2] > -1e-4).all()  # on the ground or above
+
+
+def test_a_sample_follows_from_its_generator_alone(views: list[ObjectView]) -> None:
+    first, again = (draw_sample(views[0], OPTIONS, np.random.default_rng([7, 1, 3])) for _ in range(2))
+    other = draw_sample(views[0], OPTIONS, np.random.default_rng([7, 1, 4]))
+    assert first is not None and again is not None and other is not None
+    assert (first == again).all()
+    assert not torch.equal(first["observation", "points"], other["observation", "points"])
+
+
+def test_direction_points_towards_opening(views: list[ObjectView]) -> None:
+    for view in views:
+        for link in view.openable:
+            direction = view.direction(link)
+            j = view.obj.movable.index(link)
+            assert direction[j] == np.sign(view.open[j] - view.closed[j])
+            assert np.count_nonzero(direction) == 1
+        assert np.count_nonzero(view.direction(None)) == len(view.obj.movable)
+
+
+def test_flow_leads_from_closed_to_open(views: list[ObjectView]) -> None:
+    for view in views:
+        link = view.openable[0]
+        j = view.obj.movable.index(link)
+        qpos = view.closed.copy()
+        qpos[j] += 0.3 * (view.open[j] - view.closed[j])
+        rng = np.random.default_rng(0)
+        points, links = view.cloud(qpos, View(20.0, 35.0), 400, rng)
+        flow = view.flow(points, links, qpos, view.direction(link)).double()
+        further = qpos.copy()
+        further[j] += 1e-4 * (view.open[j] - view.closed[j])
+        here, there = ((view.base @ view.tree.forward(torch.as_tensor(q)))[links] for q in (qpos, further))
+        homogeneous = torch.cat([torch.as_tensor(points).double(), torch.ones(len(points), 1).double()], dim=-1)
+        moved = (there @ torch.linalg.inv(here) @ homogeneous[..., None])[:, :3, 0] - homogeneous[:, :3]
+        moved = torch.where(torch.as_tensor(links >= 0)[:, None], moved, 0.0)
+        torch.testing.assert_close(flow, moved / moved.norm(dim=-1).max(), atol=2e-3, rtol=0)
+
+
+def test_shares_are_kept(views: list[ObjectView]) -> None:
+    view = next(v for v in views if v.obj.category == "StorageFurniture")
+    always = dataclasses.replace(OPTIONS, closed_share=1.0, others_closed=1.0, all_parts_share=0.0, points=512)
+    fixed = dataclasses.replace(always, views=ViewRange((0.0, 0.0), (30.0, 30.0)))
+    closed, _ = view.cloud(view.closed, View(0.0, 30.0), 1024, np.random.default_rng(0))
+    everything = {tuple(point) for point in closed.tolist()}
+    sample = draw_sample(view, fixed, np.random.default_rng(1))
+    assert sample is not None
+    seen = sample["observation", "points"][sample["observation", "valid"]]
+    assert {tuple(point) for point in seen.tolist()} <= everything  # the picture of the closed object
+    parts = [draw_sample(view, dataclasses.replace(OPTIONS, all_parts_share=0.5), np.random.default_rng(i)) for i in range(60)]
+    share = np.mean([sample is not None and int(sample["target"]) == -1 for sample in parts])
+    assert 0.3 < share < 0.7
+
+
+def test_a_part_that_does_not_show_gives_no_sample(views: list[ObjectView]) -> None:
+    view = next(v for v in views if v.obj.category == "Microwave")
+    behind = dataclasses.replace(
+        OPTIONS, views=ViewRange((180.0, 180.0), (0.0, 0.0)), closed_share=1.0, others_closed=1.0
+    )
+    assert draw_sample(view, behind, np.random.default_rng(0)) is None
