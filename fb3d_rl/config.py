@@ -68,10 +68,14 @@ class CameraConfig:
 
 @dataclass
 class AlgoConfig:
-    """fb3d_rl.training.fit.FitOptions and the network's arguments."""
+    """fb3d_rl.training.fit.FitOptions and the network's arguments.
+
+    Attributes:
+        epochs: how often each training sample is drawn; with the batch size it gives the number of steps.
+    """
 
     name: str
-    steps: int
+    epochs: float
     batch_size: int
     lr: float
     schedule: str
@@ -170,10 +174,9 @@ class EvaluationConfig:
 
 
 @dataclass
-class TrainConfig:
-    """Everything that launch/train.py needs."""
+class CommandConfig:
+    """What launch/train.py and launch/evaluate.py share."""
 
-    algo: AlgoConfig
     assets: AssetsConfig
     data: DataConfig
     camera: CameraConfig
@@ -182,25 +185,24 @@ class TrainConfig:
     evaluation: EvaluationConfig
     seed: int
     device: str
+
+
+@dataclass
+class TrainConfig(CommandConfig):
+    """Everything that launch/train.py needs; ``resume`` goes on from the run folder's checkpoint."""
+
+    algo: AlgoConfig
     resume: bool
 
 
 @dataclass
-class EvaluateConfig:
+class EvaluateConfig(CommandConfig):
     """Everything that launch/evaluate.py needs; ``checkpoint`` is a file that launch/train.py wrote."""
 
-    assets: AssetsConfig
-    data: DataConfig
-    camera: CameraConfig
-    env: EnvConfig
-    policy: PolicyConfig
-    evaluation: EvaluationConfig
     checkpoint: str | None
-    seed: int
-    device: str
 
 
-def validate(cfg: TrainConfig | EvaluateConfig) -> None:
+def validate(cfg: CommandConfig) -> None:
     """Check values that types cannot; the one place for it.
 
     Raises:
@@ -214,11 +216,14 @@ def validate(cfg: TrainConfig | EvaluateConfig) -> None:
         _one_of("algo.name", cfg.algo.name, ("artflownet",))
         _one_of("policy.name", cfg.policy.name, ("artflownet",))
         _one_of("algo.schedule", cfg.algo.schedule, ("constant", "one_cycle"))
-        for key in ("steps", "batch_size", "lr", "log_every", "neighbors"):
-            _at_least(f"algo.{key}", getattr(cfg.algo, key), 1 if key != "lr" else 1e-12)
+        for key in ("batch_size", "log_every", "neighbors"):
+            _at_least(f"algo.{key}", getattr(cfg.algo, key), 1)
+        for key in ("epochs", "lr"):
+            if getattr(cfg.algo, key) <= 0:
+                raise UserError(f"algo.{key}={getattr(cfg.algo, key)} must be greater than 0")
         _at_least("data.train_samples", cfg.data.train_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
-    elif cfg.policy.name == "artflownet" and not cfg.checkpoint:
+    if isinstance(cfg, EvaluateConfig) and cfg.policy.name == "artflownet" and not cfg.checkpoint:
         raise UserError("policy=artflownet needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
     _at_least("seed", cfg.seed, 0)
     _at_least("data.points", cfg.data.points, 16)

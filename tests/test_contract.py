@@ -12,7 +12,7 @@ from fb3d_rl import contract
 def filled(group: str, lead: tuple[int, ...] = (2, 3), points: int = 5) -> TensorDict:
     td = TensorDict({}, batch_size=lead)
     for key, entry in contract.spec(group).items():
-        shape = [points if size == "N" else size for size in entry.shape]
+        shape = [points if isinstance(size, str) else size for size in entry.shape]
         td.set(key, torch.zeros(*lead, *shape, dtype=entry.dtype))
     return td
 

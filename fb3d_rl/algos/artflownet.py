@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -86,7 +87,7 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     """How ArtFlowNet is fitted."""
     algo = cfg.algo
     return FitOptions(
-        steps=algo.steps,
+        steps=math.ceil(algo.epochs * cfg.data.train_samples / algo.batch_size),
         batch_size=algo.batch_size,
         lr=algo.lr,
         schedule=algo.schedule,

@@ -25,7 +25,7 @@ from fb3d_rl.policies.flow_policy import FlowPolicyOptions, VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, EvaluateConfig, TrainConfig
+    from fb3d_rl.config import AssetsConfig, CommandConfig
 
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
@@ -50,7 +50,7 @@ def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
     return [(load_object(entry.folder), entry.split) for entry in entries]
 
 
-def sample_options(cfg: TrainConfig | EvaluateConfig) -> SampleOptions:
+def sample_options(cfg: CommandConfig) -> SampleOptions:
     """How clouds are taken."""
     camera, data = cfg.camera, cfg.data
     return SampleOptions(
@@ -63,7 +63,7 @@ def sample_options(cfg: TrainConfig | EvaluateConfig) -> SampleOptions:
     )
 
 
-def env_options(cfg: TrainConfig | EvaluateConfig) -> EnvOptions:
+def env_options(cfg: CommandConfig) -> EnvOptions:
     """The task's constants."""
     env = cfg.env
     return EnvOptions(
@@ -83,18 +83,18 @@ def env_options(cfg: TrainConfig | EvaluateConfig) -> EnvOptions:
     )
 
 
-def flow_policy_options(cfg: TrainConfig | EvaluateConfig) -> FlowPolicyOptions:
+def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
     """Speeds and distances of the flow policy."""
     return FlowPolicyOptions(**asdict(cfg.policy.flow), contact=ContactOptions(**asdict(cfg.policy.contact)))
 
 
-def velocity_limits(cfg: TrainConfig | EvaluateConfig) -> VelocityLimits:
+def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
     """What action 1 means for the gripper."""
     gripper = env_options(cfg).gripper
     return VelocityLimits(gripper.v_max, gripper.w_max)
 
 
-def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
+def protocol(cfg: CommandConfig) -> Protocol:
     """What is evaluated."""
     return Protocol(
         samples=sample_options(cfg),
@@ -122,7 +122,7 @@ def workers(count: int | None) -> int:
     return (os.cpu_count() or 1) if count is None else count
 
 
-def facts(cfg: TrainConfig | EvaluateConfig) -> dict[str, Any]:
+def facts(cfg: CommandConfig) -> dict[str, Any]:
     """What summary.json says about a run besides its numbers."""
     return {
         "command": " ".join(["python", *sys.argv]),

@@ -37,9 +37,8 @@ def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_ou
     """
     unknown = [name for name in categories if name not in procedural.FAMILIES]
     if unknown or not categories:
-        raise UserError(
-            f"assets.categories: {', '.join(unknown) or 'the list is empty'}; choose from {', '.join(procedural.FAMILIES)}"
-        )
+        wrong = ", ".join(unknown) or "the list is empty"
+        raise UserError(f"assets.categories: {wrong}; choose from {', '.join(procedural.FAMILIES)}")
     entries = []
     # Held-out objects come from another seed, so no training object can be among them.
     for split, number, part_seed in (("train_train", count, 2 * seed), ("train_test", held_out, 2 * seed + 1)):

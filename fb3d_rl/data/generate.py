@@ -46,8 +46,8 @@ def generate_samples(
         progress: called with the number of samples drawn so far.
 
     Returns:
-        TensorDict [S] of the contract's group "sample" plus "object" [S] int64, an index into ``folders``, and "target" [S]
-        int64, the index of the link to open (-1: all movable parts).
+        TensorDict [S] of the contract's group "sample" plus "object" [S] int64, an index into ``folders``, and
+        "target" [S] int64, the index of the link to open (-1: all movable parts).
 
     Raises:
         UserError: an object never shows an openable part, so no sample can be drawn of any.

@@ -1,4 +1,4 @@
-"""3D articulation flow (3DAF): how each visible point would move if the part were opened a little (supplement, II.B)."""
+"""3D articulation flow (3DAF): how each visible point would move if the part opened a little (supplement, II.B)."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 from pathlib import Path
@@ -85,7 +86,8 @@ def test_splits_cover_a_root_once(root: Path) -> None:
 
 def test_a_split_file_replaces_the_lists(root: Path, tmp_path: Path) -> None:
     pot = next(root.glob("*KitchenPot*")).name
-    (tmp_path / "mine.json").write_text('{"train": {"KitchenPot": {"train": ["%s"], "test": []}}, "test": {}}' % pot)
+    content = {"train": {"KitchenPot": {"train": [pot], "test": []}}, "test": {}}
+    (tmp_path / "mine.json").write_text(json.dumps(content))
     entries = partnet_catalog(str(root), "train_train,KitchenPot", str(tmp_path / "mine.json"))
     assert {e.id: e.split for e in entries}[pot] == "train_train"
 

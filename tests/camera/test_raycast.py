@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
@@ -21,11 +22,11 @@ OPTIONS = CameraOptions(resolution=33)
 FRONT = View(0.0, 0.0)
 
 
-def mesh_of(made: trimesh.Trimesh, at: Sequence[float] = (0, 0, 0)) -> Mesh:
+def mesh_of(made: trimesh.Trimesh, at: ArrayLike = (0, 0, 0)) -> Mesh:
     return Mesh(np.array(made.vertices) + np.array(at, dtype=float), np.array(made.faces, dtype=np.int64))
 
 
-def box(extents: Sequence[float], at: Sequence[float] = (0, 0, 0)) -> Mesh:
+def box(extents: ArrayLike, at: ArrayLike = (0, 0, 0)) -> Mesh:
     return mesh_of(trimesh.creation.box(extents=extents), at)
 
 

@@ -27,7 +27,9 @@ def folders(procedural_root: Path) -> list[Path]:
     return sorted(procedural_root.iterdir())
 
 
-def draw(out: Path, folders: list[Path], seed: int = 0, options: SampleOptions = OPTIONS, workers: int = 0) -> TensorDictBase:
+def draw(
+    out: Path, folders: list[Path], seed: int = 0, options: SampleOptions = OPTIONS, workers: int = 0
+) -> TensorDictBase:
     return generate_samples(out, folders, COUNT, seed, options, workers)
 
 
@@ -111,7 +113,9 @@ def block(tmp_path: Path, folders: list[Path]) -> Path:
     return folder
 
 
-def test_rows_of_objects_that_show_nothing_are_copies_of_others(tmp_path: Path, folders: list[Path], block: Path) -> None:
+def test_rows_of_objects_that_show_nothing_are_copies_of_others(
+    tmp_path: Path, folders: list[Path], block: Path
+) -> None:
     rows = draw(tmp_path / "s", [block, *folders[:1]])
     contract.check(rows, "sample")
     assert (rows["object"] == 1).all()

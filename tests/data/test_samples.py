@@ -100,7 +100,10 @@ def test_shares_are_kept(views: list[ObjectView]) -> None:
     assert sample is not None
     seen = sample["observation", "points"][sample["observation", "valid"]]
     assert {tuple(point) for point in seen.tolist()} <= everything  # the picture of the closed object
-    parts = [draw_sample(view, dataclasses.replace(OPTIONS, all_parts_share=0.5), np.random.default_rng(i)) for i in range(60)]
+    parts = [
+        draw_sample(view, dataclasses.replace(OPTIONS, all_parts_share=0.5), np.random.default_rng(i))
+        for i in range(60)
+    ]
     share = np.mean([sample is not None and int(sample["target"]) == -1 for sample in parts])
     assert 0.3 < share < 0.7
 

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Link, Mesh
 
 
-def pose(xyz: Sequence[float] = (0, 0, 0), turn: Rotation | None = None) -> np.ndarray:
+def pose(xyz: ArrayLike = (0, 0, 0), turn: Rotation | None = None) -> np.ndarray:
     transform = np.eye(4)
     transform[:3, 3] = xyz
     if turn is not None:
@@ -20,7 +21,7 @@ def pose(xyz: Sequence[float] = (0, 0, 0), turn: Rotation | None = None) -> np.n
     return transform
 
 
-def box(extents: Sequence[float], centre: Sequence[float] = (0, 0, 0)) -> Mesh:
+def box(extents: ArrayLike, centre: ArrayLike = (0, 0, 0)) -> Mesh:
     """A box whose long triangles are cut up no further."""
     made = trimesh.creation.box(extents=extents, transform=pose(centre))
     return Mesh(np.array(made.vertices, dtype=np.float64), np.array(made.faces, dtype=np.int64))
@@ -28,7 +29,7 @@ def box(extents: Sequence[float], centre: Sequence[float] = (0, 0, 0)) -> Mesh:
 
 def joint(
     kind: JointType,
-    axis: Sequence[float] = (0, 0, 0),
+    axis: ArrayLike = (0, 0, 0),
     limits: tuple[float, float] = (0.0, 0.0),
     origin: np.ndarray | None = None,
 ) -> Joint:

@@ -48,7 +48,9 @@ def check(objects: Iterable[ArticulatedObject]) -> None:
     env.close()
 
 
-def check_flow(env: OpenArticulatedEnv, obj: ArticulatedObject, qpos: torch.Tensor, j: int, rng: np.random.Generator) -> None:
+def check_flow(
+    env: OpenArticulatedEnv, obj: ArticulatedObject, qpos: torch.Tensor, j: int, rng: np.random.Generator
+) -> None:
     direction = torch.zeros(len(qpos), dtype=torch.float64)
     direction[j] = 1.0
     links = np.arange(len(obj.links)).repeat(3)

@@ -26,7 +26,9 @@ CABINET = (-1, None, "", (box((1.0, 1.0, 1.0), (0.0, 0.0, 0.5)),))
 def hinged_door(lower: float, upper: float) -> ArticulatedObject:
     """A door that lies in the cabinet's front (x = -0.5) at joint position 0, hinged at y = 0.5."""
     door = box((0.04, 0.98, 0.98), (0.02, -0.49, 0.5))
-    return make(CABINET, (0, joint("revolute", (0, 0, 1), (lower, upper), pose((-0.5, 0.5, 0))), "rotation_door", (door,)))
+    return make(
+        CABINET, (0, joint("revolute", (0, 0, 1), (lower, upper), pose((-0.5, 0.5, 0))), "rotation_door", (door,))
+    )
 
 
 def laptop(folded_at_zero: bool) -> ArticulatedObject:
@@ -85,7 +87,7 @@ def test_the_neighbours_do_not_change_which_end_is_closed() -> None:
 
 def test_an_endless_joint_has_no_range() -> None:
     for kind, limits in (("continuous", (-np.inf, np.inf)), ("revolute", (-np.inf, 0.0)), ("prismatic", (0.0, np.inf))):
-        obj = make(CABINET, (0, joint(kind, (0, 0, 1), limits), "door", (box((1, 1, 1)),)))  # type: ignore[arg-type]
+        obj = make(CABINET, (0, joint(kind, (0, 0, 1), limits), "door", (box((1, 1, 1)),)))
         check(obj, 0.0, 0.0)
         assert openable_links(obj) == [] and travel(obj, 0) == 0.0
 

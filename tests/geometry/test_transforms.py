@@ -1,4 +1,4 @@
-"""Rigid transforms, against scipy and against their own definitions, on distinct transforms that are not the identity."""
+"""Rigid transforms, against scipy and their own definitions, on distinct transforms that are not the identity."""
 
 from __future__ import annotations
 
@@ -110,7 +110,9 @@ def test_alignment_takes_source_to_target_the_shortest_way() -> None:
     close((vector * source).sum(-1), torch.zeros(200).double(), atol=1e-10)
     for i in range(0, 200, 20):
         # scipy's answer for one pair of vectors is the shortest rotation, too.
-        best, _ = Rotation.align_vectors(tf.normalize(target[i : i + 1]).numpy(), tf.normalize(source[i : i + 1]).numpy())
+        best, _ = Rotation.align_vectors(
+            tf.normalize(target[i : i + 1]).numpy(), tf.normalize(source[i : i + 1]).numpy()
+        )
         close(vector[i], best.as_rotvec(), atol=1e-6)
 
 

@@ -1,0 +1,86 @@
+"""The commands: what the user can mend ends in exit code 2 and one sentence, at once and without a trace.
+
+Each start costs seconds, so most of these tests are marked slow.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def launch(script: str, *arguments: str, cwd: Path, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, *python, str(ROOT / "launch" / script), *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+def sentence_of(result: subprocess.CompletedProcess[str]) -> str:
+    assert result.returncode == 2, result.stderr
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), result.stderr
+    assert "Traceback" not in result.stdout
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["algo.stpes=5"], ["stpes"]),
+        pytest.param(["algo=ppo"], ["ppo", "artflownet"], marks=pytest.mark.slow),
+        pytest.param(["device=gpu"], ["device=gpu", "cuda"], marks=pytest.mark.slow),
+        pytest.param(["algo.steps=many"], ["algo.steps", "many"], marks=pytest.mark.slow),
+        pytest.param(["assets=partnet_mobility"], ["assets.root"], marks=pytest.mark.slow),
+        (["assets=partnet_mobility", "assets.root=nowhere"], ["assets.root", "nowhere"]),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence_before_any_work(
+    tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
+    sentence = sentence_of(launch("train.py", *arguments, cwd=tmp_path))
+    assert all(word in sentence for word in words), sentence
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_root_without_objects_leaves_no_run_folder(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    arguments = ["assets=partnet_mobility", f"assets.root={tmp_path / 'empty'}", "hydra.run.dir=out"]
+    assert "assets.root" in sentence_of(launch("train.py", *arguments, cwd=tmp_path))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    sentence = sentence_of(launch("train.py", "hydra.run.dir=file/run", cwd=tmp_path))
+    assert "file/run" in sentence and "hydra.run.dir" in sentence
+
+
+@pytest.mark.slow
+def test_a_run_folder_in_use_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "notes.txt").write_text("mine")
+    arguments = ["resume=true", "hydra.run.dir=run", "assets.categories=[Spaceship]"]
+    sentence_of(launch("train.py", *arguments, cwd=tmp_path))
+    assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_evaluation_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
+    assert "checkpoint" in sentence_of(launch("evaluate.py", "policy=artflownet", cwd=tmp_path))
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.parametrize("script", ["train.py", pytest.param("evaluate.py", marks=pytest.mark.slow), "report.py"])
+def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> None:
+    result = launch(script, "--help", cwd=tmp_path, python=("-X", "importtime"))
+    assert result.returncode == 0 and result.stdout
+    imported = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in result.stderr.splitlines() if "|" in line}
+    assert "pathlib" in imported
+    assert not imported & {"torchrl", "mani_skill", "sapien", "trimesh"}
+    assert not any(tmp_path.iterdir())

@@ -1,0 +1,200 @@
+"""Every configuration composes, converts to its schema and is valid; every key is read; defaults are the library's."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra
+import pytest
+import yaml
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from omegaconf import OmegaConf
+
+from fb3d_rl import config
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.views import ViewRange
+from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.contract import UserError
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
+from fb3d_rl.perception.contact import ContactOptions
+from fb3d_rl.policies.flow_policy import FlowPolicyOptions
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+ABSTRACT = {"policy/flow"}  # what the options of a group share
+NEEDS: dict[tuple[str, str], list[str]] = {
+    ("train", "assets/partnet_mobility"): ["assets.root=."],
+    ("evaluate", "assets/partnet_mobility"): ["assets.root=."],
+    ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
+}
+TRAINING_ONLY = {"experiment/partnet"}
+
+
+@pytest.fixture(autouse=True)
+def composer() -> Iterator[None]:
+    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig)):
+        ConfigStore.instance().store(name=f"{name}_schema", node=schema)
+    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
+        yield
+    GlobalHydra.instance().clear()
+
+
+def compose(name: str, *overrides: str) -> Any:
+    return OmegaConf.to_object(hydra.compose(name, overrides=list(overrides)))
+
+
+def options(name: str) -> list[str]:
+    """The group options that conf/<name>.yaml can be given, as group/option."""
+    defaults = yaml.safe_load((CONF / f"{name}.yaml").read_text())["defaults"]
+    groups = [key for entry in defaults if isinstance(entry, dict) for key in entry if not key.startswith("override")]
+    found = [f"{group}/{path.stem}" for group in groups for path in sorted((CONF / group).glob("*.yaml"))]
+    return [option for option in found if option not in ABSTRACT]
+
+
+def cases() -> list[tuple[str, str]]:
+    skipped = {("train", "policy/expert"), *(("evaluate", option) for option in TRAINING_ONLY)}
+    return [
+        (name, option) for name in ("train", "evaluate") for option in options(name) if (name, option) not in skipped
+    ]
+
+
+@pytest.mark.parametrize("name", ["train", "evaluate"])
+def test_the_defaults_are_valid(name: str) -> None:
+    cfg = compose(name)
+    assert type(cfg) is {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
+    validate(cfg)
+
+
+@pytest.mark.parametrize(("name", "option"), cases())
+def test_every_option_of_every_group_is_valid(name: str, option: str) -> None:
+    validate(compose(name, option.replace("/", "="), *NEEDS.get((name, option), [])))
+
+
+def test_no_file_is_beside_the_groups() -> None:
+    used = {path for name in ("train", "evaluate") for path in options(name)} | ABSTRACT
+    files = {f"{path.parent.name}/{path.stem}" for path in CONF.glob("*/*.yaml")}
+    assert used == files
+    assert {path.stem for path in CONF.glob("*.yaml")} == {"train", "evaluate"}
+
+
+@pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_experiment_changes_something_and_is_valid(experiment: str) -> None:
+    cfg = compose("train", f"experiment={experiment}")
+    validate(cfg)
+    assert (cfg == compose("train")) == (experiment == "none")
+
+
+def test_what_the_command_line_says_goes_before_an_experiment() -> None:
+    assert compose("train", "experiment=smoke", "data.train_samples=7").data.train_samples == 7
+
+
+def sources() -> str:
+    files = [*(ROOT / "fb3d_rl/algos").glob("*.py"), *(ROOT / "launch").glob("*.py")]
+    return "\n".join(path.read_text() for path in files)
+
+
+def groups_of(schema: type) -> dict[str, type]:
+    return {f.name: getattr(config, str(f.type)) for f in dataclasses.fields(schema) if hasattr(config, str(f.type))}
+
+
+def test_every_key_is_read_by_code() -> None:
+    text = sources()
+    for schema in (TrainConfig, EvaluateConfig):
+        groups = groups_of(schema)
+        assert len(groups) >= 5
+        for group, content in {**groups, "cfg": schema}.items():
+            for key in (f.name for f in dataclasses.fields(content)):
+                if group != "cfg" or key not in groups:
+                    assert re.search(rf"\b{group}\.{key}\b", text), f"no code reads {group}.{key}"
+
+
+def test_the_run_follows_from_the_configuration() -> None:
+    from fb3d_rl.algos import setup
+    from fb3d_rl.algos.artflownet import fit_options
+
+    cfg = compose("train", "data.points=321", "camera.fov=50", "env.gripper.v_max=0.7", "env.suction.max_stretch=0.2",
+                  "policy.contact.min_distance=0.03", "policy.flow.pull_speed=0.6", "algo.steps=5", "seed=3",
+                  "evaluation.trials=null", "camera.azimuth=[1,2]", "env.gravity=true")  # fmt: skip
+    samples, env, speeds, fit = (
+        setup.sample_options(cfg), setup.env_options(cfg), setup.flow_policy_options(cfg), fit_options(cfg)
+    )  # fmt: skip
+    assert samples.points == env.points == 321 and samples.camera == env.camera and env.camera.fov == 50
+    assert tuple(samples.views.azimuth) == (1.0, 2.0) and env.gravity
+    assert env.gripper.v_max == setup.velocity_limits(cfg).linear == 0.7 and env.suction.max_stretch == 0.2
+    assert speeds.contact.min_distance == 0.03 and speeds.pull_speed == 0.6
+    assert (fit.steps, fit.seed) == (5, 3) and setup.protocol(cfg).trials is None
+
+
+PAIRS: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
+    "env/default": ((EnvOptions(),), ()),
+    "env/default:gripper": ((GripperOptions(),), ("gripper",)),
+    "env/default:suction": ((SuctionOptions(),), ("suction",)),
+    "policy/flow:flow": ((FlowPolicyOptions(),), ("flow",)),
+    "policy/flow:contact": ((ContactOptions(),), ("contact",)),
+    "camera/raycast": ((CameraOptions(), ViewRange()), ()),
+    "data/default": ((SampleOptions(),), ()),
+}
+ONLY_CONFIGURED = {"data/default": {"train_samples", "eval_samples", "workers"}}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_defaults_are_the_librarys(name: str) -> None:
+    defaults, path = PAIRS[name]
+    content = OmegaConf.to_container(OmegaConf.load(CONF / f"{name.split(':')[0]}.yaml"))
+    for key in path:
+        content = content[key]  # type: ignore[index,call-overload]
+    assert isinstance(content, dict)
+    library: dict[str, Any] = {}
+    for default in defaults:
+        library |= {f.name: getattr(default, f.name) for f in dataclasses.fields(default)}
+    values = {key: value for key, value in content.items() if not isinstance(value, dict)}
+    unknown = set(values) - set(library) - ONLY_CONFIGURED.get(name, set())
+    assert not unknown, f"{name} has keys that the library does not: {unknown}"
+    different = {
+        key: (value, library[key])
+        for key, value in values.items()
+        if key in library and (tuple(value) if isinstance(value, list) else value) != library[key]
+    }
+    assert not different, f"{name}: (configured, library's default) differ: {different}"
+
+
+@pytest.mark.parametrize(
+    ("override", "word"),
+    [
+        ("device=gpu", "device"),
+        ("seed=-1", "seed"),
+        ("algo.schedule=cosine", "algo.schedule"),
+        ("algo.steps=0", "algo.steps"),
+        ("algo.lr=0", "algo.lr"),
+        ("data.points=3", "data.points"),
+        ("data.closed_share=1.5", "data.closed_share"),
+        ("data.workers=-1", "data.workers"),
+        ("camera.azimuth=[10,-10]", "camera.azimuth"),
+        ("camera.elevation=[10]", "camera.elevation"),
+        ("camera.resolution=0", "camera.resolution"),
+        ("evaluation.trials=0", "evaluation.trials"),
+        ("env.suction.hold=all", "env.suction.hold"),
+        ("policy=expert", "policy.name"),
+        ("assets.source=shapenet", "assets.source"),
+        ("assets=partnet_mobility", "assets.root"),
+    ],
+)
+def test_values_out_of_range_are_named(override: str, word: str) -> None:
+    with pytest.raises(UserError, match=re.escape(word)):
+        validate(compose("train", override))
+
+
+def test_a_missing_checkpoint_is_named() -> None:
+    with pytest.raises(UserError, match="checkpoint"):
+        validate(compose("evaluate", "policy=artflownet"))
+
+
+def test_infinity_can_be_given() -> None:
+    assert compose("train", "env.suction.breaking_force=inf").env.suction.breaking_force == math.inf
