@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from typing import Any
 
 from fb3d_rl.contract import UserError
 
@@ -18,8 +19,9 @@ class AssetsConfig:
     Attributes:
         source: "procedural" (made on the fly) or "partnet_mobility" (read below ``root``).
         root: folder with ``<id>/mobility.urdf``.
-        split: what to train on (train.py) or evaluate on (evaluate.py).
-        eval_split: what train.py evaluates on.
+        split: what to train on (train.py) or evaluate on (evaluate.py): "all", a split, a category, an object id, or a
+            list of them.
+        eval_split: what train.py evaluates on, likewise.
         split_file: split file in UMPNet's format; UMPNet's own lists if null.
         categories: families of procedural objects.
         train_count: procedural training objects of each category.
@@ -28,8 +30,8 @@ class AssetsConfig:
 
     source: str
     root: str | None
-    split: str
-    eval_split: str
+    split: Any
+    eval_split: Any
     split_file: str | None
     categories: list[str]
     train_count: int
@@ -218,6 +220,8 @@ def validate(cfg: CommandConfig) -> None:
         _one_of("algo.schedule", cfg.algo.schedule, ("constant", "one_cycle"))
         for key in ("batch_size", "log_every", "neighbors"):
             _at_least(f"algo.{key}", getattr(cfg.algo, key), 1)
+        if not 0 <= cfg.algo.scale < 1:
+            raise UserError(f"algo.scale={cfg.algo.scale} is out of range; give a number from 0 to below 1")
         for key in ("epochs", "lr"):
             if getattr(cfg.algo, key) <= 0:
                 raise UserError(f"algo.{key}={getattr(cfg.algo, key)} must be greater than 0")
@@ -226,12 +230,17 @@ def validate(cfg: CommandConfig) -> None:
     if isinstance(cfg, EvaluateConfig) and cfg.policy.name == "artflownet" and not cfg.checkpoint:
         raise UserError("policy=artflownet needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
     _at_least("seed", cfg.seed, 0)
-    _at_least("data.points", cfg.data.points, 16)
+    _at_least("data.points", cfg.data.points, 64)
     _at_least("data.eval_samples", cfg.data.eval_samples, 1)
     _at_least("data.workers", 0 if cfg.data.workers is None else cfg.data.workers, 0)
     _at_least("assets.eval_count", cfg.assets.eval_count, 1)
     _at_least("camera.resolution", cfg.camera.resolution, 8)
+    if not 0 < cfg.camera.fov < 180:
+        raise UserError(f"camera.fov={cfg.camera.fov} is no field of view; give degrees between 0 and 180")
     _at_least("env.horizon", cfg.env.horizon, 1)
+    _at_least("env.control_freq", cfg.env.control_freq, 1)
+    if cfg.env.sim_freq % cfg.env.control_freq:
+        raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
     _at_least("evaluation.trials", 1 if cfg.evaluation.trials is None else cfg.evaluation.trials, 1)
     for key in ("closed_share", "others_closed", "all_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:
@@ -240,6 +249,10 @@ def validate(cfg: CommandConfig) -> None:
         ends = getattr(cfg.camera, key)
         if len(ends) != 2 or ends[0] > ends[1]:
             raise UserError(f"camera.{key}={ends} is no range; give two ascending angles in degrees, [lowest,highest]")
+    for key in ("split", "eval_split"):
+        words = getattr(cfg.assets, key)
+        if not (isinstance(words, (str, int)) or (isinstance(words, list) and words)):
+            raise UserError(f"assets.{key}={words} is no split; give a name or a list of names: [train_test,test]")
     if cfg.assets.source == "partnet_mobility":
         if not cfg.assets.root:
             raise UserError(

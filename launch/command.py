@@ -41,7 +41,8 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
             try:
                 cfg: Any = OmegaConf.to_object(raw)
                 validate(cfg)
-                OmegaConf.save(raw, out / "config.yaml")
+                if not (out / "config.yaml").exists():  # a resumed run keeps its own
+                    OmegaConf.save(raw, out / "config.yaml")
                 task(cfg, out)
             except UserError:
                 # A run that never began leaves no folder.
@@ -82,7 +83,7 @@ def _sentence(error: BaseException) -> str:
     where = next((line.removeprefix("full_key: ") for line in lines if line.startswith("full_key: ")), "")
     cause = error.__cause__
     detail = str(cause).splitlines()[0] if cause is not None and str(cause) else ""
-    choices = ""
+    choices = "; write several values as a list: key=[a,b]" if "Ambiguous value" in str(error) else ""
     if "Available options" in str(error):
         choices = "; choose from " + ", ".join(lines[2 : lines.index("Config search path:")])
     text = " ".join(part for part in (lines[0] if lines else type(error).__name__, detail) if part) + choices

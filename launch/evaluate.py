@@ -1,4 +1,4 @@
-"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet [checkpoint=PATH] [assets=...] [assets.split=...]``."""
+"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet [checkpoint=PATH] [assets=...] ...``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train: ``python launch/train.py [algo=artflownet] [assets=procedural|partnet_mobility assets.root=DIR] [seed=0] ...``."""
+"""Train: ``python launch/train.py [algo=artflownet] [assets=partnet_mobility assets.root=DIR] [seed=0] ...``."""
 
 from __future__ import annotations
 

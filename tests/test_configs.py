@@ -68,7 +68,7 @@ def cases() -> list[tuple[str, str]]:
 @pytest.mark.parametrize("name", ["train", "evaluate"])
 def test_the_defaults_are_valid(name: str) -> None:
     cfg = compose(name)
-    assert type(cfg) is {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
+    assert isinstance(cfg, TrainConfig if name == "train" else EvaluateConfig)
     validate(cfg)
 
 
@@ -120,7 +120,9 @@ def test_the_run_follows_from_the_configuration() -> None:
     from fb3d_rl.algos.artflownet import fit_options
 
     cfg = compose("train", "data.points=321", "camera.fov=50", "env.gripper.v_max=0.7", "env.suction.max_stretch=0.2",
-                  "policy.contact.min_distance=0.03", "policy.flow.pull_speed=0.6", "algo.steps=5", "seed=3",
+                  "policy.contact.min_distance=0.03", "policy.flow.pull_speed=0.6",
+                  "algo.epochs=2", "algo.batch_size=8", "data.train_samples=21",
+                  "seed=3",
                   "evaluation.trials=null", "camera.azimuth=[1,2]", "env.gravity=true")  # fmt: skip
     samples, env, speeds, fit = (
         setup.sample_options(cfg), setup.env_options(cfg), setup.flow_policy_options(cfg), fit_options(cfg)
@@ -129,7 +131,7 @@ def test_the_run_follows_from_the_configuration() -> None:
     assert tuple(samples.views.azimuth) == (1.0, 2.0) and env.gravity
     assert env.gripper.v_max == setup.velocity_limits(cfg).linear == 0.7 and env.suction.max_stretch == 0.2
     assert speeds.contact.min_distance == 0.03 and speeds.pull_speed == 0.6
-    assert (fit.steps, fit.seed) == (5, 3) and setup.protocol(cfg).trials is None
+    assert (fit.steps, fit.batch_size, fit.seed) == (6, 8, 3) and setup.protocol(cfg).trials is None
 
 
 PAIRS: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
@@ -171,7 +173,7 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("device=gpu", "device"),
         ("seed=-1", "seed"),
         ("algo.schedule=cosine", "algo.schedule"),
-        ("algo.steps=0", "algo.steps"),
+        ("algo.epochs=0", "algo.epochs"),
         ("algo.lr=0", "algo.lr"),
         ("data.points=3", "data.points"),
         ("data.closed_share=1.5", "data.closed_share"),
@@ -198,3 +200,8 @@ def test_a_missing_checkpoint_is_named() -> None:
 
 def test_infinity_can_be_given() -> None:
     assert compose("train", "env.suction.breaking_force=inf").env.suction.breaking_force == math.inf
+
+
+@pytest.mark.parametrize("split", ["test", "[train_test,test]", "[test,Laptop,10098]", "10098"])
+def test_splits_can_be_given_as_a_name_an_id_or_a_list(split: str) -> None:
+    validate(compose("train", "assets=partnet_mobility", "assets.root=.", f"assets.split={split}"))

@@ -49,7 +49,9 @@ def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_ou
     return entries
 
 
-def partnet_catalog(root: str | None, split: str, split_file: str | None = None) -> list[Entry]:
+def partnet_catalog(
+    root: str | None, split: str | int | Sequence[object], split_file: str | None = None
+) -> list[Entry]:
     """The objects below a PartNet-Mobility root that ``split`` selects; broken ones are left out and named.
 
     Args:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from fb3d_rl.contract import UserError
@@ -56,12 +56,14 @@ def split_of(name: str, category: str, table: Mapping[str, str]) -> str:
     return "train_test" if zlib.crc32(name.encode()) % 1000 < 1000 * HELD_OUT_SHARE else "train_train"
 
 
-def select_ids(categories: Mapping[str, str], split: str, table: Mapping[str, str]) -> list[str]:
+def select_ids(
+    categories: Mapping[str, str], split: str | int | Sequence[object], table: Mapping[str, str]
+) -> list[str]:
     """Ids that ``split`` names, sorted.
 
     Args:
         categories: object id -> category of all objects there are.
-        split: "all", a split's name, or a comma list of split names, categories and object ids.
+        split: "all", a split's name, a category or an object id; or several of them, in a list or with commas.
         table: object id -> split, from :func:`read_split`.
 
     Raises:
@@ -69,7 +71,8 @@ def select_ids(categories: Mapping[str, str], split: str, table: Mapping[str, st
     """
     known_categories = set(categories.values())
     chosen: set[str] = set()
-    for word in _words(split):
+    words = str(split).split(",") if isinstance(split, (str, int)) else [str(word) for word in split]
+    for word in filter(None, map(str.strip, words)):
         name = word.replace("-", "_")
         if word == "all":
             chosen.update(categories)
@@ -86,7 +89,3 @@ def select_ids(categories: Mapping[str, str], split: str, table: Mapping[str, st
     if not chosen:
         raise UserError(f"assets.split: no object of this root belongs to {split!r}")
     return sorted(chosen)
-
-
-def _words(split: str) -> Iterable[str]:
-    return [word.strip() for word in split.split(",") if word.strip()]

@@ -33,8 +33,9 @@ def generate_samples(
 ) -> TensorDictBase:
     """Fill a memory map with ``count`` samples of the objects in ``folders``.
 
-    Sample i depends on (seed, i) alone, whatever the number of workers. Objects take turns, so that each is seen
-    equally often up to one. A finished data set in ``out`` that was made from the same arguments is reused.
+    Given the objects and the count, sample i depends on (seed, i) alone, whatever the number of workers. Objects take
+    turns, so that each is seen equally often up to one. A finished data set in ``out`` that was made from the same
+    arguments is reused.
 
     Args:
         out: folder of the memory map; written anew unless it holds the same data set.
@@ -53,7 +54,7 @@ def generate_samples(
         UserError: an object never shows an openable part, so no sample can be drawn of any.
     """
     recipe = {
-        "objects": [folder.name for folder in folders],
+        "objects": [str(folder.resolve()) for folder in folders],
         "count": count,
         "seed": seed,
         "options": asdict(options),

@@ -63,7 +63,8 @@ def evaluate(
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
-    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, and prints the table.
+    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, and
+    prints the table.
 
     Args:
         out: the run folder.
@@ -138,7 +139,8 @@ def _keep_clouds(path: Path, samples: Any, predicted: torch.Tensor, about: Seque
         by_category.setdefault(obj.category, []).append(i)
     order: list[int] = []
     for turn in range(max(map(len, by_category.values()))):
-        order += [rows[(turn * 7) % len(rows)] for rows in by_category.values() if turn < len(rows)]
+        # A stride that is coprime to usual numbers of samples per object passes through all objects.
+        order += [rows[(turn * 11) % len(rows)] for rows in by_category.values() if turn < len(rows)]
     chosen = list(dict.fromkeys(order))[:count]
     cosine = flow_metrics(predicted, samples["privileged", "flow"], samples["observation", "valid"])["cosine"]
     titles = [

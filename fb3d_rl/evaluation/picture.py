@@ -54,8 +54,9 @@ def _draw(axes: object, points: NDArray[np.float32], part: NDArray[np.bool_], fl
     axes.scatter(*moving.T, s=3.5, c="#2f6fb2", depthshade=False)  # type: ignore[attr-defined]
     shown = np.flatnonzero(part)[:: max(1, int(part.sum()) // ARROWS)]
     axes.quiver(*points[shown].T, *(LENGTH * flow[shown]).T, color="#e07b1a", linewidth=0.9, arrow_length_ratio=0.3)  # type: ignore[attr-defined]
-    centre = 0.5 * (points.min(0) + points.max(0))
-    reach = 0.55 * float((points.max(0) - points.min(0)).max())
+    drawn = np.concatenate([points, points[shown] + LENGTH * flow[shown]])
+    centre = 0.5 * (drawn.min(0) + drawn.max(0))
+    reach = 0.5 * float((drawn.max(0) - drawn.min(0)).max())
     for name, middle in zip("xyz", centre, strict=True):
         getattr(axes, f"set_{name}lim")(middle - reach, middle + reach)
     axes.view_init(elev=25, azim=-150)  # type: ignore[attr-defined]

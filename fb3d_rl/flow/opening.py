@@ -64,8 +64,8 @@ def opening_range(obj: ArticulatedObject) -> tuple[NDArray[np.float64], NDArray[
     tree = KinematicTree.from_object(obj)
     closed, opened = lower.copy(), upper.copy()
     for j in np.flatnonzero((np.abs(upper) < 1e-3) & (lower < -1e-3)):
-        others = tree.descendants.numpy().copy()
-        others[j] = False
+        moves = tree.descendants.numpy()
+        others = moves[~moves[:, obj.movable[j]]]  # joints that do not carry the part
         alone = np.flatnonzero(~others.any(0))
         folded, modelled = rest.copy(), rest.copy()
         folded[j], modelled[j] = lower[j], upper[j]
@@ -73,6 +73,15 @@ def opening_range(obj: ArticulatedObject) -> tuple[NDArray[np.float64], NDArray[
         if volumes[1] < 1.02 * volumes[0]:
             closed[j], opened[j] = upper[j], lower[j]
     return closed, opened
+
+
+def _rigid(obj: ArticulatedObject, link: int) -> set[int]:
+    """The link and all that is fixed to it."""
+    fixed = {link}
+    for i in obj.descendants(link):
+        if obj.links[i].parent in fixed and i not in obj.movable:
+            fixed.add(i)
+    return fixed
 
 
 def travel(obj: ArticulatedObject, joint: int) -> float:
@@ -83,9 +92,13 @@ def travel(obj: ArticulatedObject, joint: int) -> float:
         return 0.0
     if obj.joint_of(link).type == "prismatic":
         return float(upper - lower)
-    corners = _corners(obj.links[link])
-    axis = obj.joint_of(link).axis
-    radius = np.linalg.norm(np.cross(corners, axis), axis=-1).max(initial=0.0)
+    poses = KinematicTree.from_object(obj).forward(torch.zeros(len(obj.movable))).numpy()
+    to_link = np.linalg.inv(poses[link])
+    radius = 0.0
+    for carried in _rigid(obj, link):
+        pose = to_link @ poses[carried]
+        corners = _corners(obj.links[carried]) @ pose[:3, :3].T + pose[:3, 3]
+        radius = max(radius, np.linalg.norm(np.cross(corners, obj.joint_of(link).axis), axis=-1).max(initial=0.0))
     return float(radius * min(upper - lower, np.pi))
 
 

@@ -95,11 +95,7 @@ def objects(folder: Path, request: pytest.FixtureRequest) -> list[tuple[Path, Li
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:
@@ -163,9 +159,7 @@ def test_files(objects: list[tuple[Path, Link, list[Link]]]) -> None:
             np.testing.assert_allclose(entry["jointData"]["axis"]["direction"], link.axis, atol=1e-6)
             np.testing.assert_allclose(entry["jointData"]["axis"]["origin"], link.origin, atol=1e-6)
         assert table[-1]["parent"] == -1
-    assert len({tuple(np.round(body.meshes[0].vertices.ravel(), 3)) for _, body, _ in objects}) == len(
-        objects
-    )
+    assert len({tuple(np.round(body.meshes[0].vertices.ravel(), 3)) for _, body, _ in objects}) == len(objects)
 
 
 def test_joints_open_outwards(objects: list[tuple[Path, Link, list[Link]]]) -> None:
@@ -194,9 +188,7 @@ def test_pieces_are_convex_and_watertight(objects: list[tuple[Path, Link, list[L
                 assert mesh.is_watertight, path
                 assert mesh.is_winding_consistent, path
                 assert mesh.volume > 1e-7, path
-                height = mesh.vertices @ mesh.face_normals.T - (mesh.triangles[:, 0] * mesh.face_normals).sum(
-                    1
-                )
+                height = mesh.vertices @ mesh.face_normals.T - (mesh.triangles[:, 0] * mesh.face_normals).sum(1)
                 assert height.max() < 1e-4, path  # every corner lies behind every face
 
 
@@ -241,18 +233,14 @@ def test_separating_axes() -> None:
 
 def test_parts_touch_nothing_while_they_move(objects: list[tuple[Path, Link, list[Link]]]) -> None:
     for path, body, movable in objects:
-        static = {
-            id(link): [corners_and_directions(mesh) for mesh in link.meshes] for link in (body, *movable)
-        }
+        static = {id(link): [corners_and_directions(mesh) for mesh in link.meshes] for link in (body, *movable)}
         for link in movable:
             others = [piece for other in (body, *movable) if other is not link for piece in static[id(other)]]
             low = np.stack([piece[0].min(0) for piece in others])
             high = np.stack([piece[0].max(0) for piece in others])
             for share in (0, 0.02, 0.05, 0.25, 0.5, 0.75, 1):
                 q = share * link.limits[1]
-                turn = (
-                    Rotation.from_rotvec(q * link.axis) if link.joint == "revolute" else Rotation.identity()
-                )
+                turn = Rotation.from_rotvec(q * link.axis) if link.joint == "revolute" else Rotation.identity()
                 for points, normals, edges in static[id(link)]:
                     moved = (link.moved(points, q), turn.apply(normals), turn.apply(edges))
                     near = ((moved[0].min(0) < high + GAP) & (moved[0].max(0) > low - GAP)).all(1)

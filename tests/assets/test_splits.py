@@ -54,9 +54,11 @@ def test_unlisted_objects_go_by_category_and_a_stable_share_is_held_out() -> Non
         ("Laptop", ["1", "2", "x-5"]),
         ("4, Laptop,4", ["1", "2", "4", "x-5"]),
         ("x-5", ["x-5"]),
+        (["train_test", "test"], ["2", "3", "4"]),
+        ([4, "Laptop"], ["1", "2", "4", "x-5"]),
     ],
 )
-def test_words_select(split: str, ids: list[str]) -> None:
+def test_words_select(split: str | list[object], ids: list[str]) -> None:
     table = {**TABLE, "x-5": "train_train"}
     assert select_ids(CATEGORIES, split, table) == ids
 

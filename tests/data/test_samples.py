@@ -114,3 +114,21 @@ def test_a_part_that_does_not_show_gives_no_sample(views: list[ObjectView]) -> N
         OPTIONS, views=ViewRange((180.0, 180.0), (0.0, 0.0)), closed_share=1.0, others_closed=1.0
     )
     assert draw_sample(view, behind, np.random.default_rng(0)) is None
+
+
+def test_a_joint_written_the_other_way_round_gives_the_same_sample(views: list[ObjectView]) -> None:
+    obj = next(v for v in views if v.obj.category == "StorageFurniture").obj
+    links = []
+    for link in obj.links:
+        joint = link.joint
+        if joint is not None and joint.movable:
+            joint = dataclasses.replace(joint, axis=-joint.axis, limits=(-joint.limits[1], -joint.limits[0]))
+        links.append(dataclasses.replace(link, joint=joint))
+    plain, turned = ObjectView(obj, CAMERA), ObjectView(dataclasses.replace(obj, links=tuple(links)), CAMERA)
+    np.testing.assert_array_equal(turned.open, -plain.open)
+    for seed in range(4):
+        first, second = (draw_sample(view, OPTIONS, np.random.default_rng(seed)) for view in (plain, turned))
+        assert first is not None and second is not None
+        assert torch.equal(first["observation", "part_mask"], second["observation", "part_mask"])
+        for key in (("observation", "points"), ("privileged", "flow")):
+            torch.testing.assert_close(first[key], second[key], atol=1e-5, rtol=0)

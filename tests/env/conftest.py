@@ -13,7 +13,7 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
-from fb3d_rl.env.options import EnvOptions, default_trial
+from fb3d_rl.env.options import EnvOptions, GripperOptions, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
 
 POINTS = 256
@@ -49,8 +49,8 @@ def links_called(obj: ArticulatedObject, semantic: str) -> list[int]:
 
 
 def velocity(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Tensor:
-    """An action [1, 8] for hand velocities in m/s, at the default v_max of 1."""
-    return torch.tensor([[x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0]])
+    """An action [1, 8] for hand velocities in m/s, at the default v_max."""
+    return torch.tensor([[x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0]]) / GripperOptions().v_max
 
 
 def place_before(env: OpenArticulatedEnv, link: int, obs: dict[str, dict[str, Tensor]]) -> None:

@@ -32,10 +32,10 @@ def sentence_of(result: subprocess.CompletedProcess[str]) -> str:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["algo.stpes=5"], ["stpes"]),
+        (["algo.epcohs=5"], ["epcohs"]),
         pytest.param(["algo=ppo"], ["ppo", "artflownet"], marks=pytest.mark.slow),
         pytest.param(["device=gpu"], ["device=gpu", "cuda"], marks=pytest.mark.slow),
-        pytest.param(["algo.steps=many"], ["algo.steps", "many"], marks=pytest.mark.slow),
+        pytest.param(["algo.epochs=many"], ["algo.epochs", "many"], marks=pytest.mark.slow),
         pytest.param(["assets=partnet_mobility"], ["assets.root"], marks=pytest.mark.slow),
         (["assets=partnet_mobility", "assets.root=nowhere"], ["assets.root", "nowhere"]),
     ],
