@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -103,3 +105,20 @@ def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_pat
     run_evaluation(config("evaluate", [*same, "policy=artflownet", f"checkpoint={first / 'checkpoint.pt'}"]), tmp_path)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
     assert (tmp_path / "flow_rows.csv").read_bytes() == (first / "flow_rows.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_training_and_flow_metrics_need_no_simulator(tmp_path: Path) -> None:
+    launch = Path(CONF).parent / "launch"
+    overrides = [item for item in SMALL if not item.startswith("evaluation.")]
+    program = f"""
+import runpy, sys
+sys.modules["mani_skill"] = sys.modules["sapien"] = None  # as if they were not installed
+sys.path.insert(0, {str(launch)!r})
+sys.argv = ["train.py", *{overrides!r}, "evaluation.trials=0", "hydra.run.dir={tmp_path / "run"}"]
+runpy.run_path({str(launch / "train.py")!r}, run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=200, check=False)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert "flow/cosine" in summary and "success_rate" not in summary

@@ -25,7 +25,7 @@ from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_text, write_trials
 from fb3d_rl.evaluation.tables import show, summary
-from fb3d_rl.evaluation.trials import schedule
+from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 
@@ -39,7 +39,7 @@ class Protocol:
     Attributes:
         samples: clouds, views and camera of trials and flow samples.
         env: the task's constants.
-        trials: at most this many trials, None for all.
+        trials: at most this many trials, None for all, 0 for none.
         samples_per_object: flow samples of each object and target.
         clouds: clouds kept for the report.
         seed: base seed of trials and samples.
@@ -83,14 +83,15 @@ def evaluate(
         measured, extra = _measure_flow(out, net, objects, protocol)
         numbers |= extra
         write_flow(out / "flow_rows.csv", measured)
-    scheduled, hidden = schedule(objects, protocol.samples, protocol.seed, protocol.trials)
-    numbers["n_hidden_parts"] = hidden
+    scheduled: list[Scheduled] = []
+    if protocol.trials != 0:
+        scheduled, numbers["n_hidden_parts"] = schedule(objects, protocol.samples, protocol.seed, protocol.trials)
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
     rows: list[TrialRow] = []
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns) as bar:
-        for name, policy in policies.items():
+        for name, policy in policies.items() if scheduled else ():
             task = bar.add_task(f"trials: {name}", total=len(scheduled))
             rows += run_trials(name, policy, shown, scheduled, protocol.env, partial(_advance, bar, task))
             write_trials(out / "rows.csv", rows)

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, lazy_stack
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.evaluation.rows import FlowRow
 from fb3d_rl.flow.metrics import flow_metrics
@@ -27,6 +28,9 @@ def held_out_samples(
     Returns:
         For each target the samples [S] (contract group "sample") and for each sample its object, split and link's
         name ("*" for all movable parts). Objects that show no openable part have none.
+
+    Raises:
+        UserError: no object shows one.
     """
     drawn: dict[str, tuple[list[TensorDict], list[tuple[ArticulatedObject, str, str]]]] = {t: ([], []) for t in TARGETS}
     for obj, split in objects:
@@ -42,6 +46,8 @@ def held_out_samples(
                     drawn[target][0].append(sample)
                     link = "*" if target == "all" else obj.links[int(sample["target"])].name
                     drawn[target][1].append((obj, split, link))
+    if not drawn["part"][0]:
+        raise UserError("none of the objects to evaluate on shows a part that opens; choose others or wider views")
     return {t: (lazy_stack(samples).contiguous(), about) for t, (samples, about) in drawn.items() if samples}
 
 
