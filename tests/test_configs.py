@@ -181,7 +181,7 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("camera.azimuth=[10,-10]", "camera.azimuth"),
         ("camera.elevation=[10]", "camera.elevation"),
         ("camera.resolution=0", "camera.resolution"),
-        ("evaluation.trials=0", "evaluation.trials"),
+        ("evaluation.trials=-1", "evaluation.trials"),
         ("env.suction.hold=all", "env.suction.hold"),
         ("policy=expert", "policy.name"),
         ("assets.source=shapenet", "assets.source"),

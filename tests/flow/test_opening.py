@@ -85,6 +85,29 @@ def test_the_neighbours_do_not_change_which_end_is_closed() -> None:
     check(lid, -1.57, 0.0)
 
 
+def test_a_lid_on_a_turning_base_is_judged_with_its_own_shape() -> None:
+    base = box((0.4, 0.6, 0.02), (0.0, 0.0, 0.01))
+    screen = box((0.02, 0.6, 0.4), (0.0, 0.0, 0.2))
+    obj = make(
+        (-1, None, "", ()),
+        (0, joint("continuous", (0, 0, 1)), "turntable", (base,)),
+        (1, joint("revolute", (0, 1, 0), (-1.57, 0.0), pose((0.2, 0.0, 0.02))), "screen", (screen,)),
+    )
+    closed, opened = opening_range(obj)
+    assert (closed[1], opened[1]) == pytest.approx((-1.57, 0.0))
+
+
+def test_a_part_whose_mesh_hangs_on_a_fixed_child_opens() -> None:
+    door = box((0.04, 0.98, 0.98), (0.02, -0.49, 0.5))
+    obj = make(
+        CABINET,
+        (0, joint("revolute", (0, 0, 1), (0.0, 1.57), pose((-0.5, 0.5, 0))), "rotation_door", ()),
+        (1, joint("fixed"), "panel", (door,)),
+    )
+    assert openable_links(obj) == [1]
+    assert travel(obj, 0) > 1.0
+
+
 def test_an_endless_joint_has_no_range() -> None:
     for kind, limits in (("continuous", (-np.inf, np.inf)), ("revolute", (-np.inf, 0.0)), ("prismatic", (0.0, np.inf))):
         obj = make(CABINET, (0, joint(kind, (0, 0, 1), limits), "door", (box((1, 1, 1)),)))
