@@ -54,10 +54,9 @@ def load_object(folder: str | Path) -> ArticulatedObject:
 
 def _parse(urdf: Path) -> Element:
     try:
-        root: Element = ElementTree.parse(urdf).getroot()
+        return ElementTree.fromstring(urdf.read_bytes())
     except (LookupError, ValueError) as error:  # the XML declaration names an encoding that Python's parser lacks
         raise ParseError(str(error)) from error
-    return root
 
 
 class _Reader:
