@@ -68,7 +68,7 @@ def _one_sentence() -> Iterator[None]:
             raise
         fail(f"{error.filename} cannot be written or read ({error.strerror}); choose another folder: hydra.run.dir=DIR")
     except KeyboardInterrupt:
-        fail("interrupted; a training run goes on with resume=true hydra.run.dir=DIR")
+        fail("interrupted; a run folder with a checkpoint.pt goes on with: resume=true hydra.run.dir=FOLDER")
 
 
 def fail(sentence: str) -> None:

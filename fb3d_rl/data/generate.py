@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
@@ -80,10 +81,14 @@ def generate_samples(
     else:
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet) as pool:
             futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
-            for future in as_completed(futures):
-                missing += future.result()
-                drawn += futures[future]
-                progress(drawn)
+            try:
+                for future in as_completed(futures):
+                    missing += future.result()
+                    drawn += futures[future]
+                    progress(drawn)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # or leaving would first draw all that is still to come
+                raise
     rows = TensorDict.load_memmap(out / "rows")
     _refill(rows, sorted(missing), count)
     temporary = done_file.with_suffix(".tmp")
@@ -94,6 +99,7 @@ def generate_samples(
 
 def _quiet() -> None:
     torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends the workers
 
 
 def _empty_rows(count: int, points: int) -> TensorDict:
