@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import shutil
 import signal
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -80,7 +82,8 @@ def generate_samples(
             progress(drawn)
     else:
         with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet) as pool:
-            futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
+            with _no_interrupt():
+                futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
             try:
                 for future in as_completed(futures):
                     missing += future.result()
@@ -99,7 +102,19 @@ def generate_samples(
 
 def _quiet() -> None:
     torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends the workers
+
+
+@contextmanager
+def _no_interrupt() -> Iterator[None]:
+    """Processes that start in this context ignore Ctrl-C, which reaches the whole group: their parent ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _empty_rows(count: int, points: int) -> TensorDict:
