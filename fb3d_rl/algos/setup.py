@@ -13,7 +13,6 @@ import torch
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import Entry, partnet_catalog, procedural_catalog
-from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
@@ -47,7 +46,7 @@ def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
 
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
     """Read the objects; each with its split."""
-    return [(load_object(entry.folder), entry.split) for entry in entries]
+    return [(entry.load(), entry.split) for entry in entries]
 
 
 def sample_options(cfg: CommandConfig) -> SampleOptions:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fb3d_rl.assets import procedural
-from fb3d_rl.assets.partnet_mobility import find_ids, load_objects
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.partnet_mobility import find_ids, load_object, load_objects
 from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.contract import UserError
 
@@ -18,15 +19,20 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Entry:
-    """An object of a catalog: its folder, category and split."""
+    """An object of a catalog: its folder, category and split, and the object itself where it was read already."""
 
     folder: Path
     category: str
     split: str
+    known: ArticulatedObject | None = None
 
     @property
     def id(self) -> str:
         return self.folder.name
+
+    def load(self) -> ArticulatedObject:
+        """The object, read now unless it is known."""
+        return self.known or load_object(self.folder)
 
 
 def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_out: int, seed: int) -> list[Entry]:
@@ -71,7 +77,7 @@ def partnet_catalog(
     objects, skipped = load_objects(root, chosen)
     for item in skipped:
         log.warning("skipped: %s", item.reason)
-    return [Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table)) for obj in objects]
+    return [Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
 
 
 def _category(folder: Path) -> str:
