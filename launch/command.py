@@ -41,7 +41,7 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
             try:
                 cfg: Any = OmegaConf.to_object(raw)
                 validate(cfg)
-                if not (out / "config.yaml").exists():  # a resumed run keeps its own
+                if not getattr(cfg, "resume", False):  # a resumed run keeps its own
                     OmegaConf.save(raw, out / "config.yaml")
                 task(cfg, out)
             except UserError:

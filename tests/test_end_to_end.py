@@ -122,3 +122,10 @@ runpy.run_path({str(launch / "train.py")!r}, run_name="__main__")
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert "flow/cosine" in summary and "success_rate" not in summary
+    # With trials it says so before any work.
+    asked = program.replace("evaluation.trials=0", "evaluation.trials=1").replace(
+        str(tmp_path / "run"), str(tmp_path / "unused")
+    )
+    refused = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=False)
+    assert refused.returncode == 2 and "evaluation.trials=0" in refused.stderr
+    assert len(refused.stderr.splitlines()) == 1 and not (tmp_path / "unused").exists()

@@ -14,11 +14,12 @@ import torch
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import Entry, partnet_catalog, procedural_catalog
 from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
+from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.evaluation.evaluate import Protocol
-from fb3d_rl.evaluation.trials import views_of
 from fb3d_rl.perception.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
@@ -49,13 +50,18 @@ def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
     return [(entry.load(), entry.split) for entry in entries]
 
 
+def camera_options(cfg: CommandConfig) -> CameraOptions:
+    """The depth camera's optics."""
+    return CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
+
+
 def sample_options(cfg: CommandConfig) -> SampleOptions:
     """How clouds are taken."""
     camera, data = cfg.camera, cfg.data
     return SampleOptions(
         points=data.points,
-        views=views_of(camera.azimuth, camera.elevation),
-        camera=CameraOptions(camera.resolution, camera.fov, camera.margin),
+        views=ViewRange((camera.azimuth[0], camera.azimuth[1]), (camera.elevation[0], camera.elevation[1])),
+        camera=camera_options(cfg),
         closed_share=data.closed_share,
         others_closed=data.others_closed,
         all_parts_share=data.all_parts_share,
@@ -78,7 +84,7 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
         joint_damping=env.joint_damping,
         density=env.density,
         hollow=env.hollow,
-        camera=CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin),
+        camera=camera_options(cfg),
     )
 
 
@@ -94,7 +100,13 @@ def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
 
 
 def protocol(cfg: CommandConfig) -> Protocol:
-    """What is evaluated."""
+    """What is evaluated.
+
+    Raises:
+        UserError: there are trials to run, but no simulator.
+    """
+    if cfg.evaluation.trials != 0:
+        require_simulator()
     return Protocol(
         samples=sample_options(cfg),
         env=env_options(cfg),

@@ -116,8 +116,8 @@ def draw_sample(
         qpos[target] = 0.0 if rng.random() < options.closed_share else rng.random()
         qpos = view.closed + qpos * (view.open - view.closed)
         points, links = view.cloud(qpos, options.views.sample(rng), options.points, rng)
-        part = [link] if rng.random() >= options.all_parts_share else None
+        asked = link if rng.random() >= options.all_parts_share else None
         carried = view.obj.descendants(link)
         if np.isin(links, carried).sum() >= MIN_VISIBLE:
-            return view.sample(links, points, qpos, None if part is None else link)
+            return view.sample(links, points, qpos, asked)
     return None

@@ -130,6 +130,21 @@ def _specs_of(sample: TensorDictBase) -> Composite:
     return Composite(specs, shape=sample.batch_size, device=sample.device)
 
 
+def require_simulator() -> None:
+    """Import the simulator, so that a machine without it says so before any work.
+
+    Raises:
+        UserError: ManiSkill or SAPIEN is not installed, or lacks a library of the system.
+    """
+    try:
+        import fb3d_rl.env.task  # noqa: F401
+    except ImportError as error:
+        raise UserError(
+            f"the simulator cannot be loaded ({error}); install mani-skill and, for SAPIEN, the system's libX11, "
+            "or leave out the trials: evaluation.trials=0"
+        ) from error
+
+
 def make_env(
     objects: Iterable[ArticulatedObject],
     options: EnvOptions | None = None,

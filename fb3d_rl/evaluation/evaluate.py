@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,8 +27,6 @@ from fb3d_rl.evaluation.tables import show, summary
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

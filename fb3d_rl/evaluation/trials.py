@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
 from fb3d_rl.env.options import Trial, default_trial
 
@@ -74,8 +73,3 @@ def _visible_trial(view: ObjectView, link: int, options: SampleOptions, seed: in
         if np.isin(links, carried).sum() >= MIN_VISIBLE:
             return trial
     return None
-
-
-def views_of(azimuth: Sequence[float], elevation: Sequence[float]) -> ViewRange:
-    """The view range of two [lowest, highest] pairs, degrees."""
-    return ViewRange((azimuth[0], azimuth[1]), (elevation[0], elevation[1]))
