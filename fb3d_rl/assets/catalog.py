@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.partnet_mobility import find_ids, load_object, load_objects
+from fb3d_rl.assets.partnet_mobility import URDF, find_ids, load_object, load_objects
 from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.contract import UserError
 
@@ -78,6 +79,30 @@ def partnet_catalog(
     for item in skipped:
         log.warning("skipped: %s", item.reason)
     return [Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
+
+
+def find_objects(
+    objects: Iterable[ArticulatedObject] | str | Path | None, split: str | int | Sequence[object] = "all"
+) -> list[ArticulatedObject]:
+    """The objects that a user of the library names.
+
+    Args:
+        objects: the objects themselves, the folder of one object, or the folder of many; a cabinet, a microwave and a
+            pot, made anew, unless given.
+        split: which of a folder of many, see :func:`fb3d_rl.assets.splits.select_ids`.
+
+    Raises:
+        UserError: a folder holds no object, or none that can be used.
+    """
+    if objects is None:
+        with tempfile.TemporaryDirectory() as folder:
+            names = procedural.generate(Path(folder), ("StorageFurniture", "Microwave", "KitchenPot"), 1, seed=0)
+            return [load_object(Path(folder) / name) for name in names]
+    if isinstance(objects, (str, Path)):
+        if (Path(objects) / URDF).is_file():
+            return [load_object(objects)]
+        return [entry.load() for entry in partnet_catalog(str(objects), split)]
+    return list(objects)
 
 
 def _category(folder: Path) -> str:

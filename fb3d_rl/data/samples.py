@@ -15,10 +15,7 @@ from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
-from fb3d_rl.perception.cloud import sample_cloud
-
-MIN_VISIBLE = 20
-"""A part with fewer points in the cloud counts as not visible."""
+from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 
 @dataclass(frozen=True)

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+import trimesh
+from defusedxml import ElementTree
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers import PDJointVelControllerConfig
 from mani_skill.agents.registration import register_agent
 from torch import Tensor
 
+from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.env.options import GripperOptions
 
 JOINTS = ("x", "y", "z", "roll", "pitch", "yaw", "finger_left", "finger_right")
@@ -61,3 +66,19 @@ class FloatingSuctionGripper(BaseAgent):
         """Pose [E, 7] of the suction tip in the world: p (m) and q (wxyz, w >= 0)."""
         pose = self.robot.links_map[TOOL].pose
         return torch.cat([pose.p, torch.where(pose.q[..., :1] < 0, -pose.q, pose.q)], dim=-1)
+
+
+@cache
+def gripper_meshes() -> tuple[tuple[Mesh, ...], ...]:
+    """The shapes of ``BODIES``, for cameras: the URDF's boxes, each in its link's frame (m)."""
+    links = {link.get("name"): link for link in ElementTree.parse(FloatingSuctionGripper.urdf_path).iter("link")}
+    return tuple(tuple(_box(shape) for shape in links[name].iter("collision")) for name in BODIES)
+
+
+def _box(collision: Any) -> Mesh:
+    size, centre = (
+        np.array([float(word) for word in collision.find(path).get(name).split()])
+        for path, name in (("geometry/box", "size"), ("origin", "xyz"))
+    )
+    box = trimesh.creation.box(extents=size)
+    return Mesh(np.asarray(box.vertices) + centre, np.asarray(box.faces, dtype=np.int64))

@@ -8,7 +8,7 @@ from typing import Literal
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.camera.views import View
+from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.flow.opening import openable_links, opening_range, start_fraction
 
@@ -72,7 +72,10 @@ class EnvOptions:
     Attributes:
         gripper: drives of the gripper.
         suction: the suction spring.
-        camera: optics of the depth camera.
+        camera: the depth camera.
+        views: where it may stand; trials that the environment draws have their view from here.
+        start: how far the part to open is open at the start of such trials: "reference" (20 % in some categories, else
+            closed), "closed" or "random" (up to 90 %).
         points: number N of points of an observed cloud.
         horizon: control steps after which an episode is truncated.
         success: an episode succeeds below this normalized distance.
@@ -93,6 +96,8 @@ class EnvOptions:
     gripper: GripperOptions = field(default_factory=GripperOptions)
     suction: SuctionOptions = field(default_factory=SuctionOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
+    views: ViewRange = field(default_factory=ViewRange)
+    start: Literal["reference", "closed", "random"] = "reference"
     points: int = 1200
     horizon: int = 150
     success: float = 0.1
@@ -124,7 +129,13 @@ class Trial:
     seed: int = 0
 
 
-def default_trial(obj: ArticulatedObject, link: int | None = None, view: View | None = None, seed: int = 0) -> Trial:
+def default_trial(
+    obj: ArticulatedObject,
+    link: int | None = None,
+    view: View | None = None,
+    seed: int = 0,
+    fraction: float | None = None,
+) -> Trial:
     """The trial of the reference protocol: everything closed but the part to open, 20 % open in some categories.
 
     Args:
@@ -132,6 +143,7 @@ def default_trial(obj: ArticulatedObject, link: int | None = None, view: View | 
         link: the link to open; the first openable one unless given.
         view: the camera's view; from the front and 30 degrees above unless given.
         seed: of the random draws within the episode.
+        fraction: how far the part is open at the start, where it is not the protocol's.
 
     Raises:
         UserError: nothing of the object can be opened.
@@ -144,5 +156,5 @@ def default_trial(obj: ArticulatedObject, link: int | None = None, view: View | 
     closed, opened = opening_range(obj)
     start = closed.copy()
     j = obj.movable.index(link)
-    start[j] += start_fraction(obj.category) * (opened[j] - closed[j])
+    start[j] += (start_fraction(obj.category) if fraction is None else fraction) * (opened[j] - closed[j])
     return Trial(obj.id, link, tuple(float(q) for q in start), view or View(0.0, 30.0), seed)

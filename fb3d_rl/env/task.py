@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # nothing is rendered
 
+import gymnasium
 import numpy as np
 import sapien
 import torch
-import trimesh
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils.registration import register_env
+from mani_skill.utils.registration import register
 from mani_skill.utils.structs import Articulation
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from numpy.typing import NDArray
 from sapien.physx import (
     PhysxArticulationLinkComponent,
-    PhysxCollisionShapeBox,
     PhysxCollisionShapeConvexMesh,
     PhysxCollisionShapeTriangleMesh,
     PhysxRigidStaticComponent,
@@ -28,15 +29,16 @@ from sapien.physx import (
 from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Mesh
+from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.camera.raycast import RaycastCamera
-from fb3d_rl.contract import UserError
-from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper
+from fb3d_rl.contract import ACTION_DIM, UserError
+from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper, gripper_meshes
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.suction import Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
 from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import opening_range, standing_pose
-from fb3d_rl.perception.cloud import sample_cloud
+from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
+from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 OBJECT_BIT = 30
 """Bit of collision group 2 that the object's links and the ground share, so that they do not collide.
@@ -45,10 +47,125 @@ Parts of real objects overlap at rest and hulls overlap even more, so contact am
 an object that stands on the ground would rub on it. The gripper has no such bit: it touches all of them.
 """
 
+TASK = "OpenArticulated-v1"
+"""The task's name for ``gymnasium.make``."""
 
-@register_env("OpenArticulated-v1")
+VIEW_TRIES = 8
+"""Views that are drawn at most until one shows the part to open."""
+
+
+class Model:
+    """What is computed of an object once, however often it is built into a scene.
+
+    Attributes:
+        object: the object.
+        tree: its kinematic tree.
+        closed: joint state [J] in which everything is closed.
+        opened: joint state [J] in which everything is open.
+        T_world_base: pose [4, 4] that stands it on the ground.
+        links: what of it can be opened.
+    """
+
+    def __init__(self, obj: ArticulatedObject, options: EnvOptions) -> None:
+        self.object = obj
+        self.tree = KinematicTree.from_object(obj)
+        self.closed, self.opened = opening_range(obj)
+        self.T_world_base = standing_pose(obj)
+        self.links = openable_links(obj)
+        self._options = options
+
+    @cached_property
+    def camera(self) -> RaycastCamera:
+        """Sees the object's links and then the gripper's bodies."""
+        return RaycastCamera(self.object, gripper_meshes(), self._options.camera)
+
+    @cached_property
+    def hollow(self) -> frozenset[tuple[int, int]]:
+        """(link, collision mesh) of what collides as a surface."""
+        return _hollow_meshes(self.object, self.tree, self._options.hollow)
+
+    def poses(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """T_world_link [L, 4, 4] at a joint state [J]."""
+        return np.asarray(self.T_world_base @ self.tree.forward(torch.as_tensor(state, dtype=torch.float64)).numpy())
+
+    def bounds(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Bounds [2, 3] (m, world) of the object at a joint state [J]."""
+        poses, links = self.poses(state), self.object.links
+        points = [mesh.vertices @ pose[:3, :3].T + pose[:3, 3] for pose, link in zip(poses, links, strict=True)
+                  for mesh in link.visuals]  # fmt: skip
+        stacked = np.concatenate(points)
+        return np.stack([stacked.min(0), stacked.max(0)])
+
+
+class Stage:
+    """One of the parallel environments: the trial that runs there, and the object as it stands in its scene.
+
+    Attributes:
+        trial: the running trial.
+        model: its object.
+        target: position of the part's joint in a joint state [J].
+        goal: position (rad or m) of that joint when it is open.
+        sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
+        scene: the environment's own scene.
+        links: the object's links in the simulator, in the order of ``object.links``.
+        order: column of each of the J joints in the simulator's joint state.
+        bodies: the gripper's links that have a shape.
+        suction: holds the part.
+    """
+
+    scene: sapien.Scene
+    links: list[PhysxArticulationLinkComponent]
+    order: list[int]
+    bodies: list[PhysxArticulationLinkComponent]
+    suction: Suction
+
+    def __init__(self, trial: Trial, model: Model) -> None:
+        obj = model.object
+        if trial.link not in obj.movable or len(trial.start) != len(obj.movable):
+            raise UserError(
+                f"object {obj.id}: link {trial.link} with a start of {len(trial.start)} joints does not fit; "
+                f"its movable links are {obj.movable}"
+            )
+        self.trial, self.model, self.target = trial, model, obj.movable.index(trial.link)
+        self.goal = float(model.opened[self.target])
+        if abs(self.goal - trial.start[self.target]) < 1e-6:
+            raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
+        self.sign = 1.0 if self.goal > trial.start[self.target] else -1.0
+
+    @property
+    def object(self) -> ArticulatedObject:
+        """The object."""
+        return self.model.object
+
+    @property
+    def tree(self) -> KinematicTree:
+        """The object's kinematic tree."""
+        return self.model.tree
+
+    def place(self, trial: Trial) -> Stage:
+        """Another trial with the object that is built here already."""
+        stage = Stage(trial, self.model)
+        for name in ("scene", "links", "order", "bodies", "suction"):
+            setattr(stage, name, getattr(self, name))
+        return stage
+
+    def poses(self) -> NDArray[np.float64]:
+        """World poses [L + 3, 4, 4] of the object's links, then of the gripper's hand and fingers."""
+        return np.stack([body.entity_pose.to_transformation_matrix() for body in (*self.links, *self.bodies)]).astype(
+            np.float64
+        )
+
+    @property
+    def moved(self) -> Tensor:
+        """[L] bool, the links that the target joint carries."""
+        return self.tree.descendants[self.target]
+
+
 class OpenArticulatedEnv(BaseEnv):
     """Open one part of an articulated object.
+
+    ``gymnasium.make("fb3d_rl.env.task:OpenArticulated-v1", objects="DIR", split="test")`` makes it for any user of
+    ManiSkill; :func:`fb3d_rl.env.torchrl_env.make_env` makes it for TorchRL.
 
     **Task Description:**
     A floating suction gripper, commanded by eight velocities, opens the given part (a door, a drawer, a lid ...) of an
@@ -58,10 +175,15 @@ class OpenArticulatedEnv(BaseEnv):
     hollow bodies such as a pot (``options.hollow``).
 
     **Randomizations:**
-    None of its own: a :class:`~fb3d_rl.env.options.Trial`, handed to ``reset(options={"trial": trial})``, fixes the
-    object, the part, the joint state at the start, the camera's view and the seed of the points that are drawn from
-    the depth image. The same trial gives the same bits: every reset builds a new scene, because PhysX keeps contacts
-    and solver state of the episode before.
+    - the object, and which of its parts is to be opened (``link`` fixes the part)
+    - how far that part is open at the start (``options.start``); the other parts are closed
+    - the camera's azimuth and elevation (``options.views``), such that the part can be seen
+    - which of the depth image's points make the cloud
+
+    All of it is a :class:`~fb3d_rl.env.options.Trial`, which ``reset(seed=...)`` draws and
+    ``reset(options={"trials": [trial, ...]})`` gives, one for each environment that is reset. The same trial gives the
+    same bits on the CPU: there every reset builds a new scene, because PhysX keeps contacts and solver state of the
+    episode before.
 
     **Success Conditions:**
     - the normalized distance |q_goal - q| / |q_goal - q_start| of the part's joint is below ``options.success``;
@@ -69,34 +191,50 @@ class OpenArticulatedEnv(BaseEnv):
       control steps.
 
     Args:
-        objects: the objects that trials may name.
+        objects: what stands in the scene: objects, a PartNet-Mobility folder of one object or of many; a few procedural
+            objects unless given.
         options: the task's constants.
-        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "state_dict" (no points) or "none".
+        split: of a folder of many objects, those of this split, category or id (a name or a list).
+        link: name of the link to open, where it is always the same.
+        num_envs: environments that run side by side; more than one need CUDA.
+        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "state" (flat), "state_dict", "rgbd" (needs
+            Vulkan) or "none"; ``reward_mode`` "normalized_dense" or "sparse".
 
     Raises:
-        UserError: there is no object, or the first one has nothing to open.
+        UserError: there is no object, none has something to open, or a renderer is asked for that is not there.
     """
 
-    SUPPORTED_OBS_MODES = ("pointcloud", "state_dict", "none")
+    SUPPORTED_OBS_MODES = ("pointcloud", "state", "state_dict", "none")
     SUPPORTED_REWARD_MODES = ("normalized_dense", "sparse", "none")
     SUPPORTED_ROBOTS = [FloatingSuctionGripper.uid]
     agent: FloatingSuctionGripper
     scene: Any
-    articulation: Any
-    suction: Suction
+    stages: list[Stage]
+    """What stands in each of the E environments."""
 
-    def __init__(self, objects: Iterable[ArticulatedObject], options: EnvOptions | None = None, **kwargs: Any) -> None:
-        self.objects = {obj.id: obj for obj in objects}
+    def __init__(
+        self,
+        objects: Iterable[ArticulatedObject] | str | Path | None = None,
+        options: EnvOptions | None = None,
+        split: str | int | Sequence[object] = "all",
+        link: str | None = None,
+        num_envs: int = 1,
+        **kwargs: Any,
+    ) -> None:
+        self.objects = {obj.id: obj for obj in find_objects(objects, split)}
         if not self.objects:
             raise UserError("the environment has no object; give it at least one")
         self.options = options or EnvOptions()
-        self.trial = default_trial(next(iter(self.objects.values())))
-        self._cameras: dict[str, RaycastCamera] = {}
-        self._hollow: dict[str, frozenset[tuple[int, int]]] = {}
+        self.link = link
+        self.stages = []
+        self._models: dict[str, Model] = {}
+        self._trial_rng = np.random.default_rng(0)
+        self._contact = torch.zeros(0)
         super().__init__(
+            num_envs=num_envs,
             robot_uids=FloatingSuctionGripper.uid,
             sim_config=dict(sim_freq=self.options.sim_freq, control_freq=self.options.control_freq),
-            **{"sim_backend": "physx_cpu", "render_backend": "none", **kwargs},
+            **{"render_backend": "none", **kwargs},
         )
 
     @property
@@ -104,45 +242,90 @@ class OpenArticulatedEnv(BaseEnv):
         gravity = [0.0, 0.0, -9.81 if self.options.gravity else 0.0]
         return SimConfig(scene_config=SceneConfig(gravity=gravity))
 
+    @property
+    def max_episode_steps(self) -> int:
+        """The horizon, by the name under which ManiSkill's vector environment looks for it."""
+        return self.options.horizon
+
     # ------------------------------------------------------------------------------------------------ reset
 
     def reset(
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode in all environments, or in those that ``options["env_idx"]`` names.
 
         Args:
-            seed: unused; the trial has the seed.
-            options: ``{"trial": Trial}``; without one the last trial is run again.
+            seed: of the trials that are drawn from here on.
+            options: ``{"trials": [Trial, ...]}`` with one trial for each environment that is reset; without it they
+                are drawn.
 
         Raises:
-            UserError: the trial names an object or a part that does not exist, or that cannot be opened.
+            UserError: a trial names an object or a part that does not exist or cannot be opened, or only some
+                environments are reset and one of them shall get another object.
         """
         options = dict(options or {})
-        self._set_trial(options.pop("trial", self.trial))
-        return super().reset(seed=[self.trial.seed], options=options | {"reconfigure": True})
+        if seed is not None:
+            self._trial_rng = np.random.default_rng(seed)
+        which = sorted(int(i) for i in options.get("env_idx", range(self.num_envs)))
+        trials = options.pop("trials", None)
+        if trials is None:
+            trials = [self._draw_trial() for _ in which]
+        if len(trials) != len(which):
+            raise UserError(f"{len(trials)} trials for {len(which)} environments; give one for each that is reset")
+        drafts = [Stage(trial, self._model(trial.object)) for trial in trials]
+        full = len(which) == self.num_envs
+        same = bool(self.stages) and all(
+            self.stages[i].object is draft.object for i, draft in zip(which, drafts, strict=True)
+        )
+        if not full and not same:
+            raise UserError("another object needs a reset of all environments, since the whole scene is built anew")
+        # On CUDA building is slow and bits differ between runs in any case.
+        build = full and not (same and self.device.type == "cuda")
+        if build:
+            self.stages = drafts
+        else:
+            for i, trial in zip(which, trials, strict=True):
+                self.stages[i] = self.stages[i].place(trial)
+        options |= {"reconfigure": build, "env_idx": torch.tensor(which, device=self.device)}
+        return super().reset(seed=[stage.trial.seed for stage in self.stages] if full else None, options=options)
 
-    def _set_trial(self, trial: Trial) -> None:
-        obj = self.objects.get(trial.object)
-        if obj is None:
-            raise UserError(f"the trial's object {trial.object!r} is none of the environment's {len(self.objects)}")
-        if trial.link not in obj.movable or len(trial.start) != len(obj.movable):
-            raise UserError(
-                f"object {obj.id}: link {trial.link} with a start of {len(trial.start)} joints does not fit; "
-                f"its movable links are {obj.movable}"
-            )
-        joint = obj.movable.index(trial.link)
-        goal = float(opening_range(obj)[1][joint])
-        if abs(goal - trial.start[joint]) < 1e-6:
-            raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
-        self.trial, self.object, self.target, self.goal = trial, obj, joint, goal
+    def _model(self, name: str) -> Model:
+        if name not in self.objects:
+            raise UserError(f"the trial's object {name!r} is none of the environment's {len(self.objects)}")
+        if name not in self._models:
+            self._models[name] = Model(self.objects[name], self.options)
+        return self._models[name]
+
+    def _draw_trial(self) -> Trial:
+        """A trial from the environment's own generator; its view shows the part if one of ``VIEW_TRIES`` does."""
+        rng, names = self._trial_rng, list(self.objects)
+        for i in rng.permutation(len(names)):
+            model = self._model(names[i])
+            links = [j for j in model.links if self.link in (None, model.object.links[j].name)]
+            if links:
+                break
+        else:
+            what = "no part that opens" if self.link is None else f"no part that opens and is called {self.link!r}"
+            raise UserError(f"the objects have {what}; choose other objects: {', '.join(names[:5])}")
+        link, seed = int(rng.choice(links)), int(rng.integers(2**31))
+        fraction = float(rng.uniform(0.0, 0.9)) if self.options.start == "random" else None
+        for _ in range(VIEW_TRIES):
+            view = self.options.views.sample(rng)
+            trial = default_trial(model.object, link, view, seed, 0.0 if self.options.start == "closed" else fraction)
+            # The hand starts beside the view; it stands where it hides nothing.
+            poses = np.concatenate([model.poses(trial.start), np.tile(np.eye(4), (len(BODIES), 1, 1))])
+            poses[len(model.object.links) :, 2, 3] = -1e3
+            _, seen = model.camera.capture(poses, view)
+            if np.isin(seen, model.object.descendants(link)).sum() >= MIN_VISIBLE:
+                break
+        return trial
 
     def _clear(self) -> None:
         # BaseEnv collects garbage here, which takes 0.2 s with torch loaded; the scene is freed without it.
         self._close_viewer()
         self.scene = None
-        for name in ("agent", "suction", "articulation", "_links", "_bodies", "_static"):
-            self.__dict__.pop(name, None)
+        self.__dict__.pop("agent", None)
+        self.__dict__.pop("articulation", None)
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         self.agent = FloatingSuctionGripper(
@@ -159,79 +342,106 @@ class OpenArticulatedEnv(BaseEnv):
         ground.collision_groups[2] |= 1 << OBJECT_BIT
         ground.initial_pose = sapien.Pose()
         ground.build_static(name="ground")
-        self.tree = KinematicTree.from_object(self.object)
-        base = standing_pose(self.object)
-        self.T_world_base = torch.as_tensor(base)
-        self.articulation = _build(self, self.object, base, self.options)
-        links = self.articulation.links_map
-        self._links: list[PhysxArticulationLinkComponent] = [links[link.name]._objs[0] for link in self.object.links]
-        if self.object.id not in self._hollow:
-            self._hollow[self.object.id] = _hollow_meshes(self.object, self.tree, self.options.hollow)
-        self._static = _add_shapes(self.object, self._links, self._hollow[self.object.id], self.options.density)
-        entity = sapien.Entity()
-        entity.add_component(self._static)
-        self.scene.sub_scenes[0].add_entity(entity)
         own = self.agent.robot.links_map
-        self._bodies = [own[name]._objs[0] for name in BODIES]
-        active = [joint.child_link.name for joint in self.articulation.active_joints]
-        self._order = torch.tensor([active.index(self.object.links[i].name) for i in self.object.movable])
-        joints = range(len(self.object.movable)) if self.options.suction.hold == "any" else [self.target]
-        holdable = self.tree.descendants[list(joints)].any(0).nonzero().flatten().tolist()
-        self.suction = Suction(
-            self.scene.sub_scenes[0],
-            tool=own[TOOL]._objs[0],
-            fingers=[own[name]._objs[0] for name in FINGERS],
-            body=self._bodies,
-            parts={i: self._links[i] for i in holdable},
-            options=self.options.suction,
-        )
-        if self.object.id not in self._cameras:
-            boxes = [_box_meshes(body) for body in self._bodies]
-            self._cameras[self.object.id] = RaycastCamera(self.object, boxes, self.options.camera)
+        built = []
+        for e, stage in enumerate(self.stages):
+            articulation = _build(self, e, stage.object, stage.model.T_world_base, self.options)
+            self.remove_from_state_dict_registry(articulation)
+            built.append(articulation)
+            stage.scene = self.scene.sub_scenes[e]
+            stage.links = [articulation.links_map[link.name]._objs[0] for link in stage.object.links]
+            active = [joint.child_link.name for joint in articulation.active_joints]
+            stage.order = [active.index(stage.object.links[i].name) for i in stage.object.movable]
+            stage.bodies = [own[name]._objs[e] for name in BODIES]
+            static = _add_shapes(stage.object, stage.links, stage.model.hollow, self.options.density)
+            entity = sapien.Entity()
+            entity.add_component(static)
+            stage.scene.add_entity(entity)
+        # One view of all objects, whose joint states are padded to the longest.
+        self.articulation = Articulation.merge(built, name="object")
+        self.add_to_state_dict_registry(self.articulation)
+        joints = max(len(stage.order) for stage in self.stages)
+        self._columns = torch.zeros(self.num_envs, joints, dtype=torch.int64, device=self.device)
+        for row, stage in zip(self._columns, self.stages, strict=True):
+            row[: len(stage.order)] = torch.tensor(stage.order)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
-        qpos = torch.zeros(self.num_envs, len(self._order))
-        qpos[:, self._order] = torch.tensor(self.trial.start, dtype=torch.float32)
-        self.articulation.set_qpos(qpos)
-        solid = [body for body in (*self._links, self._static) if body.collision_shapes]
-        boxes = np.stack([body.compute_global_aabb_tight() for body in solid])
-        low, high = boxes[:, 0].min(0), boxes[:, 1].max(0)
-        hand = torch.zeros(self.num_envs, 8)
-        hand[:, 0] = float(low[0]) - self.options.gripper.distance
-        hand[:, 2] = 0.5 * float(low[2] + high[2])
+        stages = [self.stages[e] for e in env_idx.tolist()]
+        own = self.agent.robot.links_map
+        if len(stages) == self.num_envs:
+            self._contact = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+            self._force = torch.zeros(self.num_envs, 1, device=self.device)
+            self._camera_position = torch.zeros(self.num_envs, 3, device=self.device)
+            self._target = torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
+            self._start, self._goal = torch.zeros(2, self.num_envs, 1, device=self.device)
+        state = torch.zeros(len(stages), int(self.articulation.max_dof))
+        hand = torch.zeros(len(stages), ACTION_DIM)
+        for row, (e, stage) in enumerate(zip(env_idx.tolist(), stages, strict=True)):
+            start = torch.tensor(stage.trial.start, dtype=torch.float32)
+            state[row, stage.order] = start
+            low, high = stage.model.bounds(stage.trial.start)
+            hand[row, 0] = float(low[0]) - self.options.gripper.distance
+            hand[row, 2] = 0.5 * float(low[2] + high[2])
+            self._camera_position[e] = torch.as_tensor(stage.model.camera.pose(stage.trial.view)[:3, 3])
+            self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
+            self._contact[e], self._force[e] = False, 0.0
+            everything = self.options.suction.hold == "any"
+            holdable = (stage.tree.descendants.any(0) if everything else stage.moved).nonzero().flatten().tolist()
+            if hasattr(stage, "suction"):
+                stage.suction.release()
+            stage.suction = Suction(
+                stage.scene,
+                tool=own[TOOL]._objs[e],
+                fingers=[own[name]._objs[e] for name in FINGERS],
+                body=stage.bodies,
+                parts={i: stage.links[i] for i in holdable},
+                options=self.options.suction,
+            )
+        self.articulation.set_qpos(state)
         self.agent.reset(hand)
-        eye = self._cameras[self.object.id].pose(self.trial.view)[:3, 3]
-        self._camera_position = torch.as_tensor(eye, dtype=torch.float32).repeat(self.num_envs, 1)
-        self._rng = np.random.default_rng(self.trial.seed)
-        self._contact = torch.zeros(self.num_envs, 1, dtype=torch.bool)
-        self._force = torch.zeros(self.num_envs, 1)
 
     # ------------------------------------------------------------------------------------------------- step
 
-    def step(self, action: Tensor) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
-        """Make one control step; ``action`` [E, 8] in [-1, 1]."""
-        obs, reward, terminated, _, info = super().step(action)
+    def step(self, action: Any) -> tuple[dict[str, Any], Tensor, Tensor, Tensor, dict[str, Any]]:
+        """Make one control step.
+
+        Args:
+            action: [E, 8] (or [8] with one environment) in [-1, 1].
+
+        Raises:
+            UserError: the action has another shape, is not finite or out of range.
+        """
+        action = torch.as_tensor(action, dtype=torch.float32, device=self.device)
+        if action.shape not in ((self.num_envs, ACTION_DIM), (ACTION_DIM,) * (self.num_envs == 1)):
+            raise UserError(f"the action has shape {tuple(action.shape)}; give one of {(self.num_envs, ACTION_DIM)}")
+        # Rounding may leave the range by a little. Written so that nan fails too.
+        if not bool((action.abs() <= 1.0 + 1e-4).all()):
+            worst = action[~(action.abs() <= 1.0 + 1e-4)][0]
+            raise UserError(f"the action holds {float(worst):.6g}; velocities are numbers from -1 to 1")
+        obs, reward, terminated, _, info = super().step(action.clamp(-1.0, 1.0))
         truncated = (self._elapsed_steps >= self.options.horizon) & ~terminated
         return obs, reward, terminated, truncated, info
 
     def _after_simulation_step(self) -> None:
-        self.suction.update()
-        held = self.suction.held
-        self._contact |= held is not None and bool(self.tree.descendants[self.target, held])
+        for e, stage in enumerate(self.stages):
+            stage.suction.update()
+            held = stage.suction.held
+            if held is not None and bool(stage.moved[held]):
+                self._contact[e] = True
 
     def _after_control_step(self) -> None:
-        self._force[:] = float(np.linalg.norm(self.suction.take_impulse())) / self.control_timestep
+        for e, stage in enumerate(self.stages):
+            self._force[e] = float(np.linalg.norm(stage.suction.take_impulse())) / self.control_timestep
 
     def joint_positions(self) -> Tensor:
-        """Joint state [E, J] of the object (rad or m) in the order of its ``movable``."""
-        return self.articulation.get_qpos()[:, self._order]
+        """Joint states [E, J] (rad or m) in the order of each object's ``movable``, padded on the right."""
+        return self.articulation.get_qpos().gather(1, self._columns)
 
     def evaluate(self) -> dict[str, Tensor]:
         """Metrics: normalized_distance [E, 1], contact [E, 1] (suction has held the part) and success [E]."""
-        position = self.joint_positions()[:, [self.target]]
+        position = self.joint_positions().gather(1, self._target)
         # Signed, so that a part pushed past its limit by the solver's slack counts as open.
-        distance = (self.goal - position) / (self.goal - self.trial.start[self.target])
-        distance = distance.clamp_min(0.0)
+        distance = ((self._goal - position) / (self._goal - self._start)).clamp_min(0.0)
         return {
             "normalized_distance": distance,
             "contact": self._contact.clone(),
@@ -248,83 +458,128 @@ class OpenArticulatedEnv(BaseEnv):
 
     # ------------------------------------------------------------------------------------------ observation
 
-    def get_obs(self, info: dict[str, Any] | None = None, unflattened: bool = False) -> dict[str, Any]:
+    def get_obs(self, info: dict[str, Any] | None = None, unflattened: bool = False) -> Any:
         """Observation and privileged truth, by the data contract's keys, each batched over E."""
         if self._obs_mode == "none":
             return {}
         robot = self.agent.robot
+        attached = [[stage.suction.attached] for stage in self.stages]
+        poses = [stage.poses() for stage in self.stages]
         obs: dict[str, dict[str, Tensor]] = {
             "observation": {
                 "qpos": robot.get_qpos().clone(),
                 "qvel": robot.get_qvel().clone(),
                 "tool_pose": self.agent.tool_pose(),
-                "attached": torch.full((self.num_envs, 1), self.suction.attached),
+                "attached": torch.tensor(attached, device=self.device),
                 "contact_force": self._force.clone(),
                 "camera_position": self._camera_position.clone(),
             },
-            "privileged": self._joint_truth(),
+            "privileged": self._stacked([_joint_truth(s, p) for s, p in zip(self.stages, poses, strict=True)])
+            | {"joint_position": self.joint_positions().gather(1, self._target)},
         }
         if self._obs_mode == "pointcloud":
-            cloud, truth = self._cloud()
-            obs["observation"] |= cloud
-            obs["privileged"] |= truth
-        return obs
+            clouds = self._stacked([self._cloud(e, pose) for e, pose in enumerate(poses)])
+            for key in ("points", "valid", "part_mask"):
+                obs["observation"][key] = clouds[key]
+            for key in ("flow", "link"):
+                obs["privileged"][key] = clouds[key]
+        return obs if unflattened else self._flatten_raw_obs(obs)
 
-    def _joint_truth(self) -> dict[str, Tensor]:
-        joint = self.object.joint_of(self.trial.link)
-        pose = self._links[self.trial.link].entity_pose.to_transformation_matrix()
-        sign = 1.0 if self.goal > self.trial.start[self.target] else -1.0
-        axis = torch.as_tensor(sign * pose[:3, :3] @ joint.axis, dtype=torch.float32)
-        return {
-            "joint_position": self.joint_positions()[:, [self.target]],
-            "joint_axis": axis[None],
-            "joint_origin": torch.as_tensor(pose[:3, 3], dtype=torch.float32)[None],
-            "joint_prismatic": torch.full((self.num_envs, 1), joint.type == "prismatic"),
-        }
+    def _stacked(self, parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+        return {key: torch.stack([part[key] for part in parts]).to(self.device) for key in parts[0]}
 
-    def _cloud(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        poses = np.stack([body.entity_pose.to_transformation_matrix() for body in (*self._links, *self._bodies)])
-        points, ids = self._cameras[self.object.id].capture(poses.astype(np.float64), self.trial.view)
-        on_object = ids < len(self._links)
-        cloud, ids = sample_cloud(points[on_object], ids[on_object], self.options.points, self._rng)
-        link = torch.from_numpy(ids)[None]
-        world = torch.from_numpy(cloud)[None]
-        direction = torch.zeros(self.num_envs, len(self.object.movable), dtype=torch.float64)
-        direction[:, self.target] = 1.0 if self.goal > self.trial.start[self.target] else -1.0
-        flow = articulation_flow(self.tree, world, link, self.joint_positions(), direction, self.T_world_base)
+    def _cloud(self, e: int, poses: NDArray[np.float64]) -> dict[str, Tensor]:
+        """What the camera of environment ``e`` sees, and the ground-truth flow of it."""
+        stage = self.stages[e]
+        points, ids = stage.model.camera.capture(poses, stage.trial.view)
+        on_object = ids < len(stage.links)
+        # A generator for each step, so that a restored state sees the same points again.
+        rng = np.random.default_rng([stage.trial.seed, int(self._elapsed_steps[e])])
+        cloud, ids = sample_cloud(points[on_object], ids[on_object], self.options.points, rng)
+        link, world = torch.from_numpy(ids), torch.from_numpy(cloud)
+        joints = len(stage.object.movable)
+        direction = torch.zeros(joints, dtype=torch.float64)
+        direction[stage.target] = stage.sign
+        qpos = self.joint_positions()[e, :joints].cpu()
+        flow = articulation_flow(stage.tree, world, link, qpos, direction, torch.as_tensor(stage.model.T_world_base))
         valid = link >= 0
-        part = self.tree.descendants[self.target][link.clamp_min(0)] & valid
-        return (
-            {"points": world, "valid": valid, "part_mask": part},
-            {"flow": normalize_flow(flow), "link": link},
-        )
+        return {
+            "points": world,
+            "valid": valid,
+            "part_mask": stage.moved[link.clamp_min(0)] & valid,
+            "flow": normalize_flow(flow),
+            "link": link,
+        }
 
     # ------------------------------------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict[str, Any]:
-        """The simulation's state, with suction and the episode's counters."""
-        held = -1 if self.suction.held is None else self.suction.held
-        spring = np.concatenate([[held], *self.suction.anchors])
+        """The simulation's state, with suction [E, 7] and the episode's counters [E, 3]."""
         state: dict[str, Any] = super().get_state_dict()
-        state["suction"] = torch.as_tensor(spring, dtype=torch.float64)[None]
+        springs = [
+            np.concatenate([[-1 if s.suction.held is None else s.suction.held], *s.suction.anchors])
+            for s in self.stages
+        ]
+        state["suction"] = torch.as_tensor(np.stack(springs), dtype=torch.float32, device=self.device)
         state["episode"] = torch.cat([self._elapsed_steps[:, None], self._contact, self._force], dim=-1)
         return state
 
     def set_state_dict(self, state: dict[str, Any], env_idx: Tensor | None = None) -> None:
-        """Restore a state of :meth:`get_state_dict`, taken in the same trial."""
+        """Restore a state of :meth:`get_state_dict`, taken in the same trials.
+
+        Args:
+            state: rows for the environments that are restored.
+            env_idx: which they are; all unless given.
+        """
         super().set_state_dict(state, env_idx)
-        held, on_tool, on_part = np.split(state["suction"][0].numpy(), [1, 4])
-        self.suction.release()
-        if held[0] >= 0:
-            self.suction.hold(int(held[0]), on_tool, on_part)
-        elapsed, contact, force = state["episode"].split(1, dim=-1)
-        self._elapsed_steps[:] = elapsed[:, 0].to(self._elapsed_steps.dtype)
-        self._contact, self._force = contact.bool(), force.clone()
+        which = list(range(self.num_envs)) if env_idx is None else sorted(int(i) for i in env_idx)
+        for row, e in enumerate(which):
+            held, on_tool, on_part = np.split(state["suction"][row].double().cpu().numpy(), [1, 4])
+            suction = self.stages[e].suction
+            suction.release()
+            if held[0] >= 0:
+                suction.hold(int(held[0]), on_tool, on_part)
+            elapsed, contact, force = state["episode"][row]
+            self._elapsed_steps[e] = elapsed.to(self._elapsed_steps.dtype)
+            self._contact[e], self._force[e] = contact.bool(), force
+
+    def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
+        """Restore a flat state [E, D] of ``get_state()``, taken in the same trials."""
+
+        def take(like: dict[str, Any]) -> dict[str, Any]:
+            nonlocal state
+            taken: dict[str, Any] = {}
+            for key, value in like.items():
+                if isinstance(value, dict):
+                    taken[key] = take(value)
+                else:
+                    taken[key], state = state.split([value.shape[-1], state.shape[-1] - value.shape[-1]], dim=-1)
+            return taken
+
+        self.set_state_dict(take(self.get_state_dict()), env_idx)
 
 
-def _build(env: OpenArticulatedEnv, obj: ArticulatedObject, base: NDArray[np.float64], o: EnvOptions) -> Articulation:
+# ManiSkill's own decorator would wrap the task in a time limit that overrides ``truncated``.
+register(TASK, OpenArticulatedEnv)
+gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True)
+
+
+def _joint_truth(stage: Stage, poses: NDArray[np.float64]) -> dict[str, Tensor]:
+    """The axis (towards opening), origin and type of the joint to open, in the world."""
+    joint, pose = stage.object.joint_of(stage.trial.link), poses[stage.trial.link]
+    return {
+        "joint_axis": torch.as_tensor(stage.sign * pose[:3, :3] @ joint.axis, dtype=torch.float32),
+        "joint_origin": torch.as_tensor(pose[:3, 3], dtype=torch.float32),
+        "joint_prismatic": torch.tensor([joint.type == "prismatic"]),
+    }
+
+
+def _build(
+    env: OpenArticulatedEnv, e: int, obj: ArticulatedObject, base: NDArray[np.float64], o: EnvOptions
+) -> Articulation:
     """Build the object from what was read of it: its files are from strangers and are not parsed a second time."""
     builder = env.scene.create_articulation_builder()
+    builder.set_scene_idxs([e])
     builder.initial_pose = sapien.Pose(base)
     links: list[Any] = []
     for link in obj.links:
@@ -343,7 +598,7 @@ def _build(env: OpenArticulatedEnv, obj: ArticulatedObject, base: NDArray[np.flo
             sapien.Pose(link.joint.origin) * axis,
             axis,
         )
-    articulation: Articulation = builder.build(name="object", fix_root_link=True)
+    articulation: Articulation = builder.build(name=f"object-{e}", fix_root_link=True)
     for joint in articulation.active_joints:
         joint.set_friction(o.joint_friction)
         joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
@@ -418,15 +673,3 @@ def _axis_frame(joint: Joint) -> NDArray[np.float64]:
         y /= np.linalg.norm(y)
         frame[:3, :3] = np.stack([joint.axis, y, np.cross(joint.axis, y)], axis=1)
     return frame
-
-
-def _box_meshes(body: PhysxArticulationLinkComponent) -> list[Mesh]:
-    """The boxes of one of the gripper's links as meshes in the link's frame, for the camera."""
-    meshes = []
-    for shape in body.collision_shapes:
-        assert isinstance(shape, PhysxCollisionShapeBox)
-        box = trimesh.creation.box(
-            extents=2.0 * np.asarray(shape.half_size), transform=shape.local_pose.to_transformation_matrix()
-        )
-        meshes.append(Mesh(np.asarray(box.vertices, dtype=np.float64), np.asarray(box.faces, dtype=np.int64)))
-    return meshes

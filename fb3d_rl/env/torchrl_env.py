@@ -82,7 +82,7 @@ class ManiSkillEnv(EnvBase):
         if mask is not None and not mask.all():
             options["env_idx"] = mask.flatten().nonzero().flatten()
         if self._trials:
-            options["trial"] = self._trials[self._started % len(self._trials)]
+            options["trials"] = [self._trials[self._started % len(self._trials)]]
             self._started += 1
         obs, info = self.env.reset(seed=self._seed, options=options)
         self._seed = None

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
+from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Trial, default_trial
+from fb3d_rl.perception.cloud import MIN_VISIBLE
 
 
 @dataclass(frozen=True)

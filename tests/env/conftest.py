@@ -75,4 +75,4 @@ def step_until(
 
 def start(env: OpenArticulatedEnv, obj: ArticulatedObject, link: int) -> dict[str, dict[str, Tensor]]:
     """Reset to the default trial of one link."""
-    return env.reset(options={"trial": default_trial(obj, link)})[0]
+    return env.reset(options={"trials": [default_trial(obj, link)]})[0]

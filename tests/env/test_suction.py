@@ -20,7 +20,7 @@ def test_a_held_drawer_is_pulled_open(
 ) -> None:
     drawer = links_called(objects[category], "drawer")[0]
     place_before(env, drawer, start(env, objects[category], drawer))
-    held, _ = step_until(env, velocity(x=0.3), lambda: env.suction.attached)
+    held, _ = step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached)
     assert held
     opened, (obs, reward, terminated, truncated, info) = step_until(
         env, velocity(x=-0.4), lambda: bool(env.evaluate()["success"])
@@ -43,8 +43,8 @@ def test_pulling_without_touch_moves_nothing(env: OpenArticulatedEnv, objects: d
 def test_engaging_does_not_throw_the_hand(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
     drawer = links_called(objects["Table"], "drawer")[0]
     place_before(env, drawer, start(env, objects["Table"], drawer))
-    step_until(env, velocity(x=0.2), lambda: env.suction.attached)
-    assert env.suction.stretch < 0.01
+    step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
+    assert env.stages[0].suction.stretch < 0.01
     before = env.agent.tool_pose()
     for _ in range(5):
         obs, *_ = env.step(velocity())
@@ -58,7 +58,7 @@ def test_other_movable_parts_are_held_only_if_asked(objects: dict[str, Articulat
     target, other = links_called(obj, "drawer")[:2]
     env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(hold=hold)))
     place_before(env, other, start(env, obj, target))
-    held, (*_, info) = step_until(env, velocity(x=0.3), lambda: env.suction.attached, limit=20)
+    held, (*_, info) = step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached, limit=20)
     assert held == (hold == "any")
     assert not bool(info["contact"]), "another part is not the one to open"
 
@@ -68,7 +68,7 @@ def test_the_static_body_is_never_held(objects: dict[str, ArticulatedObject]) ->
     env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(hold="any")))
     obs = start(env, obj, links_called(obj, "drawer")[0])
     cloud, link = obs["observation"]["points"][0], obs["privileged"]["link"][0]
-    static = torch.tensor([i for i in range(len(obj.links)) if not env.tree.descendants[:, i].any()])
+    static = torch.tensor([i for i in range(len(obj.links)) if not env.stages[0].tree.descendants[:, i].any()])
     # From above onto the highest point of the body, the hand turned so that the tool points down.
     body = cloud[torch.isin(link, static)]
     top = body[body[:, 2].argmax()]
@@ -87,13 +87,13 @@ def test_suction_breaks_and_is_found_again(objects: dict[str, ArticulatedObject]
     drawer = links_called(obj, "drawer")[0]
     env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(breaking_force=40.0)))
     place_before(env, drawer, start(env, obj, drawer))
-    step_until(env, velocity(x=0.1), lambda: env.suction.attached)
-    lost, (*_, info) = step_until(env, velocity(x=-0.8), lambda: not env.suction.attached, limit=20)
+    step_until(env, velocity(x=0.1), lambda: env.stages[0].suction.attached)
+    lost, (*_, info) = step_until(env, velocity(x=-0.8), lambda: not env.stages[0].suction.attached, limit=20)
     assert lost and bool(info["contact"])
     for _ in range(10):
         env.step(velocity(x=-0.2))
-    assert not env.suction.attached
-    found, _ = step_until(env, velocity(x=0.1), lambda: env.suction.attached)
+    assert not env.stages[0].suction.attached
+    found, _ = step_until(env, velocity(x=0.1), lambda: env.stages[0].suction.attached)
     assert found
 
 
@@ -102,7 +102,7 @@ def test_contact_stays_on_while_a_part_is_held(env: OpenArticulatedEnv, objects:
     obj = objects["StorageFurniture"]  # starts closed: the drawer cannot give way
     drawer = links_called(obj, "drawer")[0]
     place_before(env, drawer, start(env, obj, drawer))
-    step_until(env, velocity(x=0.2), lambda: env.suction.attached)
+    step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
     before = env.agent.tool_pose()
     for _ in range(10):
         obs, *_ = env.step(velocity(x=0.1))

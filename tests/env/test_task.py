@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
+import gymnasium
 import numpy as np
 import pytest
 import sapien
 import torch
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from tensordict import TensorDict
 
 from fb3d_rl import contract
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.camera.views import View
+from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
+from fb3d_rl.flow.opening import openable_links
 
 from .conftest import POINTS, links_called, place_before, start, step_until, velocity
 
@@ -28,20 +32,20 @@ def middle(obj: ArticulatedObject, seed: int) -> torch.Tensor:
 
 def set_joints(env: OpenArticulatedEnv, state: torch.Tensor) -> None:
     qpos = torch.zeros(1, len(state))
-    qpos[:, env._order] = state.float()
+    qpos[:, env.stages[0].order] = state.float()
     env.articulation.set_qpos(qpos)
 
 
 def poses(env: OpenArticulatedEnv) -> np.ndarray:
-    return np.stack([link.entity_pose.to_transformation_matrix() for link in env._links])
+    return np.stack([link.entity_pose.to_transformation_matrix() for link in env.stages[0].links])
 
 
 def check_kinematics(env: OpenArticulatedEnv, obj: ArticulatedObject) -> None:
-    env.reset(options={"trial": default_trial(obj)})
+    env.reset(options={"trials": [default_trial(obj)]})
     for seed in range(3):
         state = middle(obj, seed)
         set_joints(env, state)
-        expected = (env.T_world_base @ env.tree.forward(state)).numpy()
+        expected = env.stages[0].model.poses(state)
         np.testing.assert_allclose(poses(env), expected, atol=1e-4)
 
 
@@ -62,13 +66,13 @@ def test_object_equals_the_one_that_maniskill_reads(
     env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
 ) -> None:
     obj = objects["StorageFurniture"]
-    env.reset(options={"trial": default_trial(obj)})
+    env.reset(options={"trials": [default_trial(obj)]})
     loader = env.scene.create_urdf_loader()
     loader.name = "reference"
     builder = loader.parse(str(obj.urdf))["articulation_builders"][0]
     for link in builder.link_builders:
         link.visual_records.clear()
-    builder.initial_pose = sapien.Pose(env.T_world_base.numpy())
+    builder.initial_pose = sapien.Pose(env.stages[0].model.T_world_base)
     reference = builder.build(fix_root_link=True)
     state = middle(obj, 0)
     set_joints(env, state)
@@ -77,9 +81,9 @@ def test_object_equals_the_one_that_maniskill_reads(
     for link, pose in zip(obj.links, poses(env), strict=True):
         other = reference.links_map[link.name]._objs[0]
         np.testing.assert_allclose(other.entity_pose.to_transformation_matrix(), pose, atol=1e-4)
-        if not env.tree.descendants[:, obj.index(link.name)].any():
+        if not env.stages[0].tree.descendants[:, obj.index(link.name)].any():
             continue
-        mass = env.articulation.links_map[link.name]._objs[0].mass
+        mass = env.stages[0].links[obj.index(link.name)].mass
         assert other.mass * env.options.density / 1000.0 == pytest.approx(mass, rel=0.02)
 
 
@@ -99,7 +103,9 @@ def test_flow_is_the_simulators_own_motion(env: OpenArticulatedEnv, objects: dic
         obs = start(env, obj, links_called(obj, semantic)[0])
         state = env.joint_positions()[0].double()
         before = poses(env)
-        state[env.target] += 0.002 * np.sign(env.goal - env.trial.start[env.target])
+        state[env.stages[0].target] += 0.002 * np.sign(
+            env.stages[0].goal - env.stages[0].trial.start[env.stages[0].target]
+        )
         set_joints(env, state)
         motion = poses(env) @ np.linalg.inv(before)
         points = obs["observation"]["points"][0].numpy()
@@ -131,7 +137,7 @@ def test_the_gripper_hides_points_and_is_none(objects: dict[str, ArticulatedObje
 
 def episode(env: OpenArticulatedEnv, trial: Trial) -> list[bytes]:
     """Push, touch and pull for some steps; every bit of every observation, and of the metrics."""
-    obs, info = env.reset(options={"trial": trial})
+    obs, info = env.reset(options={"trials": [trial]})
     place_before(env, trial.link, obs)
     record = []
     for action in [velocity(x=0.3)] * 12 + [velocity(x=-0.3, y=0.1)] * 12:
@@ -157,7 +163,7 @@ def test_a_trial_repeats_bit_for_bit(env: OpenArticulatedEnv, objects: dict[str,
 def test_state_can_be_restored(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
     drawer = links_called(objects["Table"], "drawer")[0]
     place_before(env, drawer, start(env, objects["Table"], drawer))
-    step_until(env, velocity(x=0.3), lambda: env.suction.attached)
+    step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached)
     for _ in range(5):
         env.step(velocity(x=-0.2))
     state = env.get_state_dict()
@@ -166,7 +172,7 @@ def test_state_can_be_restored(env: OpenArticulatedEnv, objects: dict[str, Artic
         for _ in range(5):
             obs, *_, info = env.step(velocity(x=-0.3))
         outcomes.append((obs["observation"]["qpos"], info["normalized_distance"], env.elapsed_steps.clone()))
-        env.suction.release()
+        env.stages[0].suction.release()
         env.step(velocity(x=-0.5))
         env.set_state_dict(state)
         restored = env.get_state_dict()
@@ -178,11 +184,109 @@ def test_state_can_be_restored(env: OpenArticulatedEnv, objects: dict[str, Artic
         torch.testing.assert_close(first, second, atol=2e-3, rtol=0)
 
 
+def test_a_flat_state_restores_all_of_it(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
+    """In another object than the first one too: its state has another length."""
+    for category in ("Table", "StorageFurniture"):
+        drawer = links_called(objects[category], "drawer")[0]
+        place_before(env, drawer, start(env, objects[category], drawer))
+        held, _ = step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached)
+        assert held
+        state, seen = env.get_state(), env.get_obs()
+        env.reset(options={"trials": [env.stages[0].trial]})
+        assert not env.stages[0].suction.attached
+        env.set_state(state)
+        torch.testing.assert_close(env.get_state(), state, atol=1e-5, rtol=0)
+        for group, entries in env.get_obs().items():
+            for key, value in entries.items():
+                torch.testing.assert_close(value, seen[group][key], atol=1e-4, rtol=0, msg=key)
+
+
 def test_an_episode_is_truncated_at_the_horizon(objects: dict[str, ArticulatedObject]) -> None:
     env = OpenArticulatedEnv([objects["Table"]], EnvOptions(points=POINTS, horizon=4))
     env.reset()
     flags = [bool(env.step(velocity())[3]) for _ in range(4)]
     assert flags == [False, False, False, True]
+
+
+def test_gymnasium_makes_it(objects: dict[str, ArticulatedObject]) -> None:
+    made = gymnasium.make(
+        "fb3d_rl.env.task:OpenArticulated-v1",
+        objects=[objects["Table"]],
+        options=EnvOptions(points=POINTS, horizon=3),
+        reward_mode="sparse",
+    )
+    obs, _ = made.reset(seed=1)
+    assert obs["observation"]["points"].shape == (1, POINTS, 3)
+    results = [made.step(made.action_space.sample()) for _ in range(3)]
+    assert [bool(truncated) for *_, truncated, _ in results] == [False, False, True]
+    assert all(float(reward) == 0.0 for _, reward, *_ in results)
+    vector = ManiSkillVectorEnv(made, record_metrics=True)
+    vector.reset(seed=1)
+    *_, info = [vector.step(vector.action_space.sample()) for _ in range(3)][-1]
+    assert int(info["final_info"]["episode"]["episode_len"]) == 3
+
+
+def test_it_needs_no_objects_from_outside() -> None:
+    made = gymnasium.make("fb3d_rl.env.task:OpenArticulated-v1", obs_mode="none")
+    assert len(made.unwrapped.objects) == 3
+
+
+def test_flat_observations_are_the_state(objects: dict[str, ArticulatedObject]) -> None:
+    flat = OpenArticulatedEnv([objects["Table"]], obs_mode="state")
+    nested = OpenArticulatedEnv([objects["Table"]], obs_mode="state_dict")
+    row, _ = flat.reset(seed=5)
+    entries, _ = nested.reset(seed=5)
+    values = [value.float() for group in entries.values() for value in group.values()]
+    torch.testing.assert_close(row, torch.cat(values, dim=-1))
+    assert flat.single_observation_space.shape == row.shape[1:]
+
+
+def test_trials_are_drawn_from_the_seed(objects: dict[str, ArticulatedObject]) -> None:
+    options = EnvOptions(points=POINTS, start="random", views=ViewRange((-30.0, 30.0), (20.0, 50.0)))
+    env = OpenArticulatedEnv(objects.values(), options)
+
+    def trials(seed: int) -> list[Trial]:
+        drawn = []
+        for i in range(12):
+            obs, _ = env.reset(seed=seed if i == 0 else None)
+            assert int(obs["observation"]["part_mask"].sum()) > 0, "the part to open is in sight"
+            drawn.append(env.stages[0].trial)
+        return drawn
+
+    first = trials(7)
+    assert trials(7) == first and trials(8) != first
+    assert len({trial.object for trial in first}) > 2
+    for trial in first:
+        assert -30 <= trial.view.azimuth <= 30 and 20 <= trial.view.elevation <= 50
+        obj = objects[next(name for name, obj in objects.items() if obj.id == trial.object)]
+        assert trial.link in openable_links(obj)
+    assert len({max(trial.start) for trial in first}) > 6, "starts differ"
+
+
+def test_the_link_can_be_named(objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["StorageFurniture"]
+    door = obj.links[links_called(obj, "rotation_door")[0]].name
+    env = OpenArticulatedEnv([objects["Oven"], obj], EnvOptions(points=POINTS, start="closed"), link=door)
+    for _ in range(5):
+        env.reset()
+        trial = env.stages[0].trial
+        assert env.objects[trial.object].links[trial.link].name == door
+    with pytest.raises(UserError, match="nowhere"):
+        OpenArticulatedEnv([obj], link="nowhere")
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 1.5, -1.01])
+def test_impossible_actions_are_refused(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject], bad: float
+) -> None:
+    start(env, objects["Table"], objects["Table"].movable[0])
+    state, action = env.get_state(), velocity()
+    action[0, 4] = bad
+    with pytest.raises(UserError, match="from -1 to 1"):
+        env.step(action)
+    with pytest.raises(UserError, match="shape"):
+        env.step(torch.zeros(1, 7))
+    torch.testing.assert_close(env.get_state(), state, atol=0, rtol=0)
 
 
 def test_nothing_is_rendered(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
@@ -196,11 +300,15 @@ def test_parts_do_not_coast_on(env: OpenArticulatedEnv, objects: dict[str, Artic
     obj = objects["Table"]
     start(env, obj, links_called(obj, "drawer")[0])
     speed = torch.zeros(1, len(obj.movable))
-    speed[:, env._order[env.target]] = 0.3
+    speed[:, env.stages[0].order[env.stages[0].target]] = 0.3
     env.articulation.set_qvel(speed)
     for _ in range(20):
         env.step(velocity())
-    assert 0.02 < float(env.joint_positions()[0, env.target]) - env.trial.start[env.target] < 0.1
+    assert (
+        0.02
+        < float(env.joint_positions()[0, env.stages[0].target]) - env.stages[0].trial.start[env.stages[0].target]
+        < 0.1
+    )
 
 
 @pytest.mark.parametrize(
@@ -216,7 +324,7 @@ def test_wrong_trials_are_refused(
 ) -> None:
     trial = dataclasses.replace(default_trial(objects["Table"]), **change)
     with pytest.raises(UserError, match=words):
-        env.reset(options={"trial": trial})
+        env.reset(options={"trials": [trial]})
 
 
 def test_a_trial_that_is_won_from_the_start_is_refused(
@@ -224,7 +332,7 @@ def test_a_trial_that_is_won_from_the_start_is_refused(
 ) -> None:
     obj = objects["Oven"]
     with pytest.raises(UserError, match="fully open"):
-        env.reset(options={"trial": dataclasses.replace(default_trial(obj), start=tuple(obj.limits[:, 1]))})
+        env.reset(options={"trials": [dataclasses.replace(default_trial(obj), start=tuple(obj.limits[:, 1]))]})
 
 
 def test_an_environment_without_objects_is_refused() -> None:

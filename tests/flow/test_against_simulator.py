@@ -27,9 +27,9 @@ def nested(obj: ArticulatedObject) -> bool:
 def simulated_poses(env: OpenArticulatedEnv, qpos: torch.Tensor) -> np.ndarray:
     """World poses [L, 4, 4] that the simulator gives the links at the joint state ``qpos`` [J]."""
     state = torch.zeros(1, len(qpos))
-    state[:, env._order] = qpos.float()
+    state[:, env.stages[0].order] = qpos.float()
     env.articulation.set_qpos(state)
-    return np.stack([link.entity_pose.to_transformation_matrix() for link in env._links]).astype(np.float64)
+    return np.stack([link.entity_pose.to_transformation_matrix() for link in env.stages[0].links]).astype(np.float64)
 
 
 def check(objects: Iterable[ArticulatedObject]) -> None:
@@ -37,12 +37,12 @@ def check(objects: Iterable[ArticulatedObject]) -> None:
     env = OpenArticulatedEnv(objects, EnvOptions(points=64))
     rng = np.random.default_rng(0)
     for obj in objects:
-        env.reset(options={"trial": default_trial(obj)})
+        env.reset(options={"trials": [default_trial(obj)]})
         limits = np.nan_to_num(obj.limits, posinf=3.0, neginf=-3.0)
         for _ in range(3):
             qpos = torch.as_tensor(rng.uniform(limits[:, 0], limits[:, 1]))
             poses = simulated_poses(env, qpos)
-            np.testing.assert_allclose(poses, (env.T_world_base @ env.tree.forward(qpos)).numpy(), atol=1e-4)
+            np.testing.assert_allclose(poses, env.stages[0].model.poses(qpos), atol=1e-4)
             for j in range(len(qpos)):
                 check_flow(env, obj, qpos, j, rng)
     env.close()
@@ -60,9 +60,8 @@ def check_flow(
         poses = simulated_poses(env, qpos + offset * direction)[links]
         return np.einsum("nij,nj->ni", poses[:, :3, :3], local) + poses[:, :3, 3]
 
-    flow = articulation_flow(
-        env.tree, torch.as_tensor(world(0.0)), torch.as_tensor(links), qpos, direction, env.T_world_base
-    )
+    tree, base = env.stages[0].tree, torch.as_tensor(env.stages[0].model.T_world_base)
+    flow = articulation_flow(tree, torch.as_tensor(world(0.0)), torch.as_tensor(links), qpos, direction, base)
     np.testing.assert_allclose(flow.numpy(), world(0.5 * STEP) - world(-0.5 * STEP), atol=1e-5)
 
 
