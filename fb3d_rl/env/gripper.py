@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -43,10 +43,23 @@ class FloatingSuctionGripper(BaseAgent):
     uid = "floating_suction_gripper"
     urdf_path = str(Path(__file__).with_name("gripper.urdf"))
     disable_self_collisions = True
+    _builder: ClassVar[Any] = None
 
     def __init__(self, *args: Any, options: GripperOptions | None = None, **kwargs: Any) -> None:
         self.options = options or GripperOptions()
         super().__init__(*args, **kwargs)
+
+    def _load_articulation(self, initial_pose: Any = None) -> None:
+        """As ManiSkill's own, but the URDF is parsed once, since that takes longer than the rest of a reset."""
+        cls = type(self)
+        if cls._builder is None:
+            loader = self.scene.create_urdf_loader()
+            loader.name, loader.disable_self_collisions = self.uid, self.disable_self_collisions
+            cls._builder = loader.parse(self.urdf_path)["articulation_builders"][0]
+        builder = cls._builder.set_scene(self.scene)
+        builder.scene_idxs, builder.initial_pose = None, initial_pose
+        self.robot = builder.build()
+        self.robot_link_names = [link.name for link in self.robot.get_links()]
 
     @property
     def _controller_configs(self) -> dict[str, PDJointVelControllerConfig]:

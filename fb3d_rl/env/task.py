@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -88,13 +89,21 @@ class Model:
         """T_world_link [L, 4, 4] at a joint state [J]."""
         return np.asarray(self.T_world_base @ self.tree.forward(torch.as_tensor(state, dtype=torch.float64)).numpy())
 
+    @cached_property
+    def _corners(self) -> NDArray[np.float64]:
+        """Corners [L, 8, 4] (homogeneous, in its frame) of each link's bounding box; nan for a link without a mesh."""
+        corners = np.full((len(self.object.links), 8, 4), np.nan)
+        for row, link in zip(corners, self.object.links, strict=True):
+            if link.visuals:
+                points = np.concatenate([mesh.vertices for mesh in link.visuals])
+                row[:, :3] = list(itertools.product(*np.stack([points.min(0), points.max(0)]).T))
+                row[:, 3] = 1.0
+        return corners
+
     def bounds(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Bounds [2, 3] (m, world) of the object at a joint state [J]."""
-        poses, links = self.poses(state), self.object.links
-        points = [mesh.vertices @ pose[:3, :3].T + pose[:3, 3] for pose, link in zip(poses, links, strict=True)
-                  for mesh in link.visuals]  # fmt: skip
-        stacked = np.concatenate(points)
-        return np.stack([stacked.min(0), stacked.max(0)])
+        """Bounds [2, 3] (m, world) of the links' bounding boxes at a joint state [J]."""
+        points = (self._corners @ self.poses(state).swapaxes(1, 2))[..., :3].reshape(-1, 3)
+        return np.stack([np.nanmin(points, 0), np.nanmax(points, 0)])
 
 
 class Stage:
