@@ -77,8 +77,10 @@ class FloatingSuctionGripper(BaseAgent):
 
     def tool_pose(self) -> Tensor:
         """Pose [E, 7] of the suction tip in the world: p (m) and q (wxyz, w >= 0)."""
-        pose = self.robot.links_map[TOOL].pose
-        return torch.cat([pose.p, torch.where(pose.q[..., :1] < 0, -pose.q, pose.q)], dim=-1)
+        poses = [body.entity_pose for body in self.robot.links_map[TOOL]._objs]
+        rows = np.array([[*pose.p, *pose.q] for pose in poses], dtype=np.float32)
+        rows[rows[:, 3] < 0, 3:] *= -1.0
+        return torch.from_numpy(rows).to(self.device)
 
 
 @cache

@@ -383,6 +383,7 @@ class OpenArticulatedEnv(BaseEnv):
             self._camera_position = torch.zeros(self.num_envs, 3, device=self.device)
             self._target = torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
             self._start, self._goal = torch.zeros(2, self.num_envs, 1, device=self.device)
+            self._prismatic = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         state = torch.zeros(len(stages), int(self.articulation.max_dof))
         hand = torch.zeros(len(stages), ACTION_DIM)
         for row, (e, stage) in enumerate(zip(env_idx.tolist(), stages, strict=True)):
@@ -393,6 +394,7 @@ class OpenArticulatedEnv(BaseEnv):
             hand[row, 2] = 0.5 * float(low[2] + high[2])
             self._camera_position[e] = torch.as_tensor(stage.model.camera.pose(stage.trial.view)[:3, 3])
             self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
+            self._prismatic[e] = stage.object.joint_of(stage.trial.link).type == "prismatic"
             self._contact[e], self._force[e] = False, 0.0
             everything = self.options.suction.hold == "any"
             holdable = (stage.tree.descendants.any(0) if everything else stage.moved).nonzero().flatten().tolist()
@@ -432,6 +434,8 @@ class OpenArticulatedEnv(BaseEnv):
         return obs, reward, terminated, truncated, info
 
     def _after_simulation_step(self) -> None:
+        if self.gpu_sim_enabled:  # suction, camera and flow read poses from the entities
+            self.scene.px.sync_poses_gpu_to_cpu()
         for e, stage in enumerate(self.stages):
             stage.suction.update()
             held = stage.suction.held
@@ -472,19 +476,23 @@ class OpenArticulatedEnv(BaseEnv):
         if self._obs_mode == "none":
             return {}
         robot = self.agent.robot
-        attached = [[stage.suction.attached] for stage in self.stages]
         poses = [stage.poses() for stage in self.stages]
+        truth = self._tensor([_joint_truth(s, p) for s, p in zip(self.stages, poses, strict=True)])
         obs: dict[str, dict[str, Tensor]] = {
             "observation": {
                 "qpos": robot.get_qpos().clone(),
                 "qvel": robot.get_qvel().clone(),
                 "tool_pose": self.agent.tool_pose(),
-                "attached": torch.tensor(attached, device=self.device),
+                "attached": self._tensor([[stage.suction.attached] for stage in self.stages]),
                 "contact_force": self._force.clone(),
                 "camera_position": self._camera_position.clone(),
             },
-            "privileged": self._stacked([_joint_truth(s, p) for s, p in zip(self.stages, poses, strict=True)])
-            | {"joint_position": self.joint_positions().gather(1, self._target)},
+            "privileged": {
+                "joint_axis": truth[:, :3],
+                "joint_origin": truth[:, 3:],
+                "joint_prismatic": self._prismatic.clone(),
+                "joint_position": self.joint_positions().gather(1, self._target),
+            },
         }
         if self._obs_mode == "pointcloud":
             clouds = self._stacked([self._cloud(e, pose) for e, pose in enumerate(poses)])
@@ -493,6 +501,9 @@ class OpenArticulatedEnv(BaseEnv):
             for key in ("flow", "link"):
                 obs["privileged"][key] = clouds[key]
         return obs if unflattened else self._flatten_raw_obs(obs)
+
+    def _tensor(self, rows: Any) -> Tensor:
+        return torch.from_numpy(np.array(rows)).to(self.device)
 
     def _stacked(self, parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
         return {key: torch.stack([part[key] for part in parts]).to(self.device) for key in parts[0]}
@@ -573,14 +584,10 @@ register(TASK, OpenArticulatedEnv)
 gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True)
 
 
-def _joint_truth(stage: Stage, poses: NDArray[np.float64]) -> dict[str, Tensor]:
-    """The axis (towards opening), origin and type of the joint to open, in the world."""
+def _joint_truth(stage: Stage, poses: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The axis (towards opening) and the origin of the joint to open, in the world, [6]."""
     joint, pose = stage.object.joint_of(stage.trial.link), poses[stage.trial.link]
-    return {
-        "joint_axis": torch.as_tensor(stage.sign * pose[:3, :3] @ joint.axis, dtype=torch.float32),
-        "joint_origin": torch.as_tensor(pose[:3, 3], dtype=torch.float32),
-        "joint_prismatic": torch.tensor([joint.type == "prismatic"]),
-    }
+    return np.concatenate([stage.sign * pose[:3, :3] @ joint.axis, pose[:3, 3]]).astype(np.float32)
 
 
 def _build(
