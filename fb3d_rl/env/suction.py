@@ -3,18 +3,83 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.env.options import SuctionOptions
 
 if TYPE_CHECKING:
     import sapien
+    from mani_skill.envs.scene import ManiSkillScene
+    from mani_skill.utils.structs import Articulation, Link
     from sapien.physx import PhysxArticulationLinkComponent, PhysxContactPoint, PhysxDriveComponent
 
 Vector = NDArray[np.float64]
+
+
+@dataclass
+class Contacts:
+    """What a physics step's contacts say of one gripper.
+
+    Attributes:
+        impulse: net impulse [3] on the gripper, N s, world.
+        touches: for each part that may be held where the fingers touch it, [3] each, m, world.
+    """
+
+    impulse: Vector
+    touches: dict[int, list[Vector]]
+
+
+class ContactImpulses:
+    """Contacts of all environments where the simulator tells impulses but no points (on CUDA).
+
+    A finger that presses on a part is taken to touch it at the tip's centre.
+
+    Args:
+        scene: the scene of all environments.
+        robot: the grippers.
+        fingers: names of its links whose touch engages suction.
+        body: names of all its links that have a shape.
+        tool: name of the link at the suction tip.
+        parts: for each environment the links that may be held, by number.
+    """
+
+    def __init__(
+        self,
+        scene: ManiSkillScene,
+        robot: Articulation,
+        fingers: Sequence[str],
+        body: Sequence[str],
+        tool: str,
+        parts: Sequence[Mapping[int, Link]],
+    ) -> None:
+        from mani_skill.utils.structs import Link
+
+        self._scene, self._robot, self._body = scene, robot, list(body)
+        self._fingers = [robot.links_map[name] for name in fingers]
+        self._tool = robot.links_map[tool]
+        # The k-th part of every environment makes one view; environments with fewer parts repeat their last one.
+        self._numbers = [list(own) for own in parts]
+        views = range(max(map(len, parts)))
+        chosen = [[own[numbers[min(k, len(own) - 1)]] for own, numbers in zip(parts, self._numbers, strict=True)]
+                  for k in views]  # fmt: skip
+        self._views = [Link.merge(links, name=f"holdable-{k}") for k, links in zip(views, chosen, strict=True)]
+
+    def read(self) -> list[Contacts]:
+        """The contacts of the physics step that was just made, one entry for each environment."""
+        net = self._robot.get_net_contact_impulses(self._body).sum(1).double().cpu().numpy()
+        found = [Contacts(impulse, {}) for impulse in net]
+        for k, view in enumerate(self._views):
+            pairs = [self._scene.get_pairwise_contact_impulses(finger, view) for finger in self._fingers]
+            pressed = torch.stack(pairs).norm(dim=-1).amax(0).cpu() > 0
+            for e in pressed.nonzero().flatten().tolist():
+                tip = np.asarray(self._tool._objs[e].entity_pose.p, dtype=np.float64)
+                found[e].touches.setdefault(self._numbers[e][min(k, len(self._numbers[e]) - 1)], [tip])
+        return found
 
 
 class Suction:
@@ -65,11 +130,10 @@ class Suction:
         on_part = _to_world(self._parts[self.held].entity_pose, self.anchors[1])
         return float(np.linalg.norm(on_tool - on_part))
 
-    def update(self) -> None:
-        """Look at the contacts of the physics step that was just made: hold, keep or lose a part."""
-        contacts = self._scene.physx_system.get_contacts()
-        touching: dict[int, list[Vector]] = {}
-        for contact in contacts:
+    def contacts(self) -> Contacts:
+        """The contacts of the physics step that was just made, where the simulator tells points (on the CPU)."""
+        found = Contacts(np.zeros(3), {})
+        for contact in self._scene.physx_system.get_contacts():
             first, second = contact.bodies
             if first in self._body:
                 own, other, sign = first, second, 1.0
@@ -79,16 +143,23 @@ class Suction:
                 continue
             points = contact.points
             for point in points:
-                self._impulse += sign * point.impulse
+                found.impulse += sign * point.impulse
             number = self._numbers.get(other)
             if number is not None and own in self._fingers and not self.attached:
-                touching.setdefault(number, []).extend(self._touches(points))
+                touches = self._touches(points)
+                if touches:
+                    found.touches.setdefault(number, []).extend(touches)
+        return found
+
+    def update(self, contacts: Contacts) -> None:
+        """Hold, keep or lose a part after a physics step with these contacts."""
+        self._impulse += contacts.impulse
         if self.attached:
             stretch = self.stretch
             if stretch > self.options.max_stretch or stretch * self.options.stiffness > self.options.breaking_force:
                 self.release()
             return
-        found = {number: positions for number, positions in touching.items() if positions}
+        found = contacts.touches
         if found:
             # The part with the touch nearest to the tip's centre; ties go to the lower number.
             tip = np.asarray(self._tool.entity_pose.p, dtype=np.float64)

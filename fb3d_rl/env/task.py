@@ -35,7 +35,7 @@ from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.contract import ACTION_DIM, UserError
 from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper, gripper_meshes
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
-from fb3d_rl.env.suction import Suction
+from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
@@ -334,7 +334,8 @@ class OpenArticulatedEnv(BaseEnv):
         self._close_viewer()
         self.scene = None
         self.__dict__.pop("agent", None)
-        self.__dict__.pop("articulation", None)
+        for name in ("articulation", "_built", "_impulses"):
+            self.__dict__.pop(name, None)
 
     def _load_agent(self, options: dict[str, Any]) -> None:
         self.agent = FloatingSuctionGripper(
@@ -366,6 +367,7 @@ class OpenArticulatedEnv(BaseEnv):
             entity = sapien.Entity()
             entity.add_component(static)
             stage.scene.add_entity(entity)
+        self._built = built
         # One view of all objects, whose joint states are padded to the longest.
         self.articulation = Articulation.merge(built, name="object")
         self.add_to_state_dict_registry(self.articulation)
@@ -396,8 +398,6 @@ class OpenArticulatedEnv(BaseEnv):
             self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
             self._prismatic[e] = stage.object.joint_of(stage.trial.link).type == "prismatic"
             self._contact[e], self._force[e] = False, 0.0
-            everything = self.options.suction.hold == "any"
-            holdable = (stage.tree.descendants.any(0) if everything else stage.moved).nonzero().flatten().tolist()
             if hasattr(stage, "suction"):
                 stage.suction.release()
             stage.suction = Suction(
@@ -405,11 +405,31 @@ class OpenArticulatedEnv(BaseEnv):
                 tool=own[TOOL]._objs[e],
                 fingers=[own[name]._objs[e] for name in FINGERS],
                 body=stage.bodies,
-                parts={i: stage.links[i] for i in holdable},
+                parts={i: stage.links[i] for i in self._holdable(stage)},
                 options=self.options.suction,
             )
         self.articulation.set_qpos(state)
         self.agent.reset(hand)
+        if self.gpu_sim_enabled:
+            self._impulses = self.contact_impulses()
+
+    def _holdable(self, stage: Stage) -> list[int]:
+        parts = stage.tree.descendants.any(0) if self.options.suction.hold == "any" else stage.moved
+        return [int(i) for i in parts.nonzero().flatten()]
+
+    def contact_impulses(self) -> ContactImpulses:
+        """A reader of the contacts of all environments for where the simulator tells no contact points."""
+        return ContactImpulses(
+            self.scene,
+            self.agent.robot,
+            FINGERS,
+            BODIES,
+            TOOL,
+            [
+                {i: built.links_map[stage.object.links[i].name] for i in self._holdable(stage)}
+                for stage, built in zip(self.stages, self._built, strict=True)
+            ],
+        )
 
     # ------------------------------------------------------------------------------------------------- step
 
@@ -436,8 +456,11 @@ class OpenArticulatedEnv(BaseEnv):
     def _after_simulation_step(self) -> None:
         if self.gpu_sim_enabled:  # suction, camera and flow read poses from the entities
             self.scene.px.sync_poses_gpu_to_cpu()
+            contacts = self._impulses.read()
+        else:
+            contacts = [stage.suction.contacts() for stage in self.stages]
         for e, stage in enumerate(self.stages):
-            stage.suction.update()
+            stage.suction.update(contacts[e])
             held = stage.suction.held
             if held is not None and bool(stage.moved[held]):
                 self._contact[e] = True

@@ -108,3 +108,31 @@ def test_contact_stays_on_while_a_part_is_held(env: OpenArticulatedEnv, objects:
         obs, *_ = env.step(velocity(x=0.1))
     assert float(obs["observation"]["contact_force"]) > 100.0
     assert float((obs["observation"]["tool_pose"] - before)[0, 0]) < 0.03
+
+
+def test_impulses_tell_touch_and_force_like_points(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    """CUDA has no contact points; on the CPU both readers can look at the same physics step."""
+    obj = objects["StorageFurniture"]
+    drawer = links_called(obj, "drawer")[0]
+    place_before(env, drawer, start(env, obj, drawer))
+    stage, reader = env.stages[0], env.contact_impulses()
+    seen = []
+
+    def both() -> None:
+        by_points, (by_impulses,) = stage.suction.contacts(), reader.read()
+        torch.testing.assert_close(by_impulses.impulse, by_points.impulse, atol=1e-6, rtol=1e-5)
+        if by_impulses.touches:
+            seen.append(set(by_impulses.touches))
+            assert seen[-1] <= set(by_points.touches)
+            (tip,) = by_impulses.touches[min(seen[-1])]
+            assert min(abs(tip - point).max() for point in by_points.touches[min(seen[-1])]) < 0.03
+        stage.suction.update(by_impulses)
+
+    env._after_simulation_step = both  # type: ignore[method-assign]
+    try:
+        held, _ = step_until(env, velocity(x=0.2), lambda: stage.suction.attached)
+    finally:
+        del env._after_simulation_step
+    assert held and seen and stage.suction.held in seen[0]
