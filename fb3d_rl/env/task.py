@@ -284,14 +284,13 @@ class OpenArticulatedEnv(BaseEnv):
 
     def _cloud(self) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         poses = np.stack([body.entity_pose.to_transformation_matrix() for body in (*self._links, *self._bodies)])
-        points, ids = self._cameras[self.object.id].capture(poses.astype(np.float64), self.trial.view)
-        on_object = ids < len(self._links)
-        cloud, ids = sample_cloud(points[on_object], ids[on_object], self.options.points, self._rng)
+        seen = self._cameras[self.object.id].capture(poses, self.trial.view, further=False)
+        cloud, ids = sample_cloud(*seen, self.options.points, self._rng)
         link = torch.from_numpy(ids)[None]
         world = torch.from_numpy(cloud)[None]
         direction = torch.zeros(self.num_envs, len(self.object.movable), dtype=torch.float64)
         direction[:, self.target] = 1.0 if self.goal > self.trial.start[self.target] else -1.0
-        flow = articulation_flow(self.tree, world, link, self.joint_positions(), direction, self.T_world_base)
+        flow = articulation_flow(self.tree, world, link, torch.from_numpy(poses[None, : len(self._links)]), direction)
         valid = link >= 0
         part = self.tree.descendants[self.target][link.clamp_min(0)] & valid
         return (
