@@ -46,5 +46,5 @@ def articulation_flow(tree: KinematicTree, points: Tensor, links: Tensor, poses:
 
 def normalize_flow(flow: Tensor, eps: float = 1e-9) -> Tensor:
     """Scale each cloud's flow [..., N, 3] so that its largest norm is 1; a cloud that does not move stays 0."""
-    largest = flow.norm(dim=-1).amax(dim=-1)[..., None, None]
-    return torch.where(largest > eps, flow / largest.clamp_min(eps), torch.zeros_like(flow))
+    largest = torch.linalg.vector_norm(flow, dim=-1).amax(dim=-1)[..., None, None]
+    return flow / torch.where(largest > eps, largest, torch.inf)
