@@ -1,11 +1,14 @@
 """A depth camera on the CPU: Embree rays on link meshes, no Vulkan, no GPU.
 
-Every link keeps one static bounding-volume hierarchy in its own frame; for each frame the rays are moved into the
-links' frames, and only the rays that can hit a link's bounding sphere are cast. Nothing is rebuilt when joints move.
+Every body keeps one static bounding-volume hierarchy in its own frame; for each frame the rays are moved into that
+frame, and only those through pixels that its bounding box may cover are cast. A body's hits are kept until its pose or
+the view changes, to the bit, so that a frame of an episode casts only what moves: a picture follows from poses and view
+alone, whatever was taken before.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,38 +42,12 @@ class CameraOptions:
     margin: float = 1.15
 
 
-class _Body:
-    """One rigid mesh with its Embree scene and bounding sphere, in its own frame."""
-
-    def __init__(self, meshes: Sequence[Mesh]) -> None:
-        self.scene = EmbreeScene()
-        triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]).astype(np.float32)
-        TriangleMesh(self.scene, triangles)
-        corners = triangles.reshape(-1, 3).astype(np.float64)
-        self.centre = 0.5 * (corners.min(0) + corners.max(0))
-        self.radius = float(np.linalg.norm(corners - self.centre, axis=-1).max())
-
-    def cast(self, pose: NDArray[np.float64], eye: NDArray[np.float64], rays: NDArray[np.float64], out: _Hits) -> None:
-        """Cast ``rays`` [R, 3] (unit, world) from ``eye`` [3] and keep hits that are nearer than those in ``out``."""
-        to_centre = pose[:3, :3] @ self.centre + pose[:3, 3] - eye
-        along = rays @ to_centre
-        near = np.flatnonzero(to_centre @ to_centre - along * along <= self.radius**2 * 1.0001)
-        if not len(near):
-            return
-        origin = (pose[:3, :3].T @ (eye - pose[:3, 3])).astype(np.float32)
-        directions = (rays[near] @ pose[:3, :3]).astype(np.float32)
-        hits = self.scene.run(np.tile(origin, (len(near), 1)), directions, output=True)
-        distance = np.where(hits["primID"] >= 0, hits["tfar"], np.inf)
-        better = distance < out.distance[near]
-        out.distance[near[better]] = distance[better]
-        out.link[near[better]] = out.current
-
-
-@dataclass
-class _Hits:
-    distance: NDArray[np.float64]
-    link: NDArray[np.int64]
-    current: int = -1
+_LOW = np.uint64(0xFFFFFFFF)
+_HALF = np.uint64(32)
+_NOTHING = np.uint64(np.float32(np.inf).view(np.uint32)) << _HALF
+"""What a pixel shows is a key: the bits of its depth (float32) above the index of its body. Depths are not negative, so
+keys sort as depths do, and of two bodies at the same depth the one with the lower index is seen, in whatever order they
+are merged. From this key on there is no hit."""
 
 
 class RaycastCamera:
@@ -87,7 +64,16 @@ class RaycastCamera:
     ) -> None:
         self.options = options or CameraOptions()
         shapes = [link.visuals for link in obj.links] + [tuple(meshes) for meshes in bodies]
-        self._bodies = [_Body(meshes) if meshes else None for meshes in shapes]
+        self._links = len(obj.links)
+        self._scenes: dict[int, EmbreeScene] = {}
+        self._corners = np.zeros((len(shapes), 3, 8))  # of the bodies' bounding boxes
+        for index, meshes in enumerate(shapes):
+            if meshes:
+                triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]).astype(np.float32)
+                self._scenes[index] = EmbreeScene()
+                TriangleMesh(self._scenes[index], triangles)
+                extents = zip(triangles.min((0, 1)), triangles.max((0, 1)), strict=True)
+                self._corners[index] = np.array(list(itertools.product(*extents))).T
         bounds = standing_bounds(obj)
         self.centre: NDArray[np.float64] = bounds.mean(0)
         """Point that the camera looks at: the centre of the closed, standing object's bounding box, m."""
@@ -96,31 +82,96 @@ class RaycastCamera:
         half = np.radians(0.5 * self.options.fov)
         self.distance = self.options.margin * self.radius / np.sin(half)
         n = self.options.resolution
-        ticks = (np.arange(n) + 0.5) / n * 2.0 - 1.0
-        x, y = np.meshgrid(ticks * np.tan(half), ticks * np.tan(half))
-        rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-        self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        self._slope = float(np.tan(half))
+        self._ticks = ((np.arange(n) + 0.5) / n * 2.0 - 1.0) * self._slope
+        # The last frame: view, poses, each body's hits (the rows and columns that it may cover and the keys there), and
+        # which links are merged in the background.
+        self._view: View | None = None
+        self._poses = np.zeros((0, 4, 4))
+        self._hits: dict[int, tuple[tuple[slice, slice], NDArray[np.uint64]]] = {}
+        self._in_background = np.zeros(0, dtype=bool)
+        self._background = np.empty((n, n), dtype=np.uint64)
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """T_world_camera [4, 4] of a view; x right, y down, z forward."""
         return look_at(view, self.centre, self.distance)
 
-    def capture(self, poses: NDArray[np.float64], view: View) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def capture(
+        self, poses: NDArray[np.float64], view: View, further: bool = True
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Take one depth image.
 
         Args:
             poses: T_world_body [L + bodies, 4, 4] of all links and further bodies.
             view: the viewpoint.
+            further: also return the points on further bodies; they hide what is behind them in any case.
 
         Returns:
             World points [P, 3] (m) where rays hit, row by row of the image, and the index of the body hit [P].
         """
-        camera = self.pose(view)
-        eye, rays = camera[:3, 3], self._rays @ camera[:3, :3].T
-        hits = _Hits(np.full(len(rays), np.inf), np.full(len(rays), -1, dtype=np.int64))
-        for index, body in enumerate(self._bodies):
-            if body is not None:
-                hits.current = index
-                body.cast(poses[index], eye, rays, hits)
-        seen = np.flatnonzero(hits.link >= 0)
-        return eye + rays[seen] * hits.distance[seen, None], hits.link[seen]
+        image = self._nearest(np.array(poses, dtype=np.float64, order="C"), view).ravel()
+        seen = np.flatnonzero((image < _NOTHING) if further else (image < _NOTHING) & ((image & _LOW) < self._links))
+        keys = image.take(seen)
+        depth = (keys >> _HALF).astype(np.uint32).view(np.float32)
+        points = np.empty((len(seen), 3))
+        for axis in range(3):
+            points[:, axis] = self._camera[axis, 3] + depth * self._rays[axis].take(seen)
+        return points, (keys & _LOW).astype(np.int64)
+
+    def _nearest(self, poses: NDArray[np.float64], view: View) -> NDArray[np.uint64]:
+        """Keys [n, n] of what each pixel shows. The hits of links that rest are kept merged, as the background."""
+        links = np.arange(len(poses)) < self._links
+        if view != self._view:
+            self._look(view)
+            rests, background = np.zeros(len(poses), dtype=bool), links
+        else:
+            rests = (poses.view(np.uint64) == self._poses.view(np.uint64)).all((1, 2))
+            background = self._in_background if rests[self._in_background].all() else rests & links
+        self._cast([index for index in np.flatnonzero(~rests).tolist() if index in self._scenes], poses)
+        if background is not self._in_background:
+            self._background.fill(_NOTHING)
+            self._merge(background, self._background)
+        self._view, self._poses, self._in_background = view, poses, background
+        image = self._background.copy()
+        self._merge(~background, image)
+        return image
+
+    def _look(self, view: View) -> None:
+        """Turn the camera and the world directions [3, n * n] of its pixels, whose depth is 1."""
+        self._camera = self.pose(view)
+        right, down, forward = self._camera[:3, :3].T[:, :, None, None]
+        self._rays = (forward + self._ticks[:, None] * down + self._ticks * right).reshape(3, -1)
+
+    def _cast(self, indices: list[int], poses: NDArray[np.float64]) -> None:
+        """Take new hits of some bodies."""
+        if not indices:
+            return
+        n, ticks, to_camera = self.options.resolution, self._ticks[:, None], self._camera[:3, :3].T
+        rotations = to_camera @ poses[indices, :3, :3]  # of T_camera_body
+        origins = to_camera @ (poses[indices, :3, 3:] - self._camera[:3, 3:])
+        corners = rotations @ self._corners[indices] + origins
+        pixels = corners[:, :2] / np.maximum(corners[:, 2:], 1e-6) * (0.5 * n / self._slope) + (0.5 * n - 0.5)
+        low, high = pixels.min(-1), pixels.max(-1)
+        beside = corners[:, 2].min(-1) <= 1e-6  # or behind the lens: the body may cover any pixel
+        low[beside], high[beside] = 0.0, n
+        # A twentieth of a pixel covers what rounding may do.
+        low = np.ceil(low - 0.05).clip(0, n).astype(np.int64).tolist()
+        high = np.floor(high + 1.05).clip(0, n).astype(np.int64).tolist()
+        # In the bodies' frames: where rays begin, and what the directions (of depth 1) in a row and in a column share.
+        starts = -(rotations * origins).sum(1).astype(np.float32)
+        rows = (rotations[:, 2:] + ticks * rotations[:, 1:2]).astype(np.float32)
+        columns = (ticks * rotations[:, :1]).astype(np.float32)
+        for k, (index, (left, top), (right, bottom)) in enumerate(zip(indices, low, high, strict=True)):
+            rays = rows[k, top:bottom, None] + columns[k, left:right]
+            begins = np.empty_like(rays)
+            begins[:] = starts[k]
+            depth = self._scenes[index].run(begins.reshape(-1, 3), rays.reshape(-1, 3), np.inf, "DISTANCE")
+            keys = (depth.view(np.uint32).astype(np.uint64) << _HALF) | np.uint64(index)
+            self._hits[index] = (slice(top, bottom), slice(left, right)), keys.reshape(rays.shape[:2])
+
+    def _merge(self, bodies: NDArray[np.bool_], image: NDArray[np.uint64]) -> None:
+        """Keep the nearer of what ``image`` [n, n] shows and the hits of some bodies."""
+        for index in np.flatnonzero(bodies).tolist():
+            if index in self._hits:
+                window, keys = self._hits[index]
+                np.minimum(image[window], keys, out=image[window])

@@ -61,8 +61,11 @@ class ObjectView:
         self, qpos: NDArray[np.float64], view: View, points: int, rng: np.random.Generator
     ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The cloud [N, 3] and link of each point [N] at joint state ``qpos`` [J]."""
-        poses = (self.base @ self.tree.forward(torch.as_tensor(qpos))).numpy()
-        return sample_cloud(*self.camera.capture(poses, view), points, rng)
+        return sample_cloud(*self.camera.capture(self.poses(qpos).numpy(), view), points, rng)
+
+    def poses(self, qpos: NDArray[np.float64]) -> torch.Tensor:
+        """T_world_link [L, 4, 4] at joint state ``qpos`` [J]."""
+        return self.base @ self.tree.forward(torch.as_tensor(qpos))
 
     def flow(
         self,
@@ -76,9 +79,8 @@ class ObjectView:
             self.tree,
             torch.as_tensor(points),
             torch.as_tensor(links),
-            torch.as_tensor(qpos),
+            self.poses(qpos),
             torch.as_tensor(direction),
-            self.base,
         )
         return normalize_flow(raw)
 

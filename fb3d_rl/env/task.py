@@ -534,17 +534,14 @@ class OpenArticulatedEnv(BaseEnv):
     def _cloud(self, e: int, poses: NDArray[np.float64]) -> dict[str, Tensor]:
         """What the camera of environment ``e`` sees, and the ground-truth flow of it."""
         stage = self.stages[e]
-        points, ids = stage.model.camera.capture(poses, stage.trial.view)
-        on_object = ids < len(stage.links)
+        seen = stage.model.camera.capture(poses, stage.trial.view, further=False)
         # A generator for each step, so that a restored state sees the same points again.
         rng = np.random.default_rng([stage.trial.seed, int(self._elapsed_steps[e])])
-        cloud, ids = sample_cloud(points[on_object], ids[on_object], self.options.points, rng)
+        cloud, ids = sample_cloud(*seen, self.options.points, rng)
         link, world = torch.from_numpy(ids), torch.from_numpy(cloud)
-        joints = len(stage.object.movable)
-        direction = torch.zeros(joints, dtype=torch.float64)
+        direction = torch.zeros(len(stage.object.movable), dtype=torch.float64)
         direction[stage.target] = stage.sign
-        qpos = self.joint_positions()[e, :joints].cpu()
-        flow = articulation_flow(stage.tree, world, link, qpos, direction, torch.as_tensor(stage.model.T_world_base))
+        flow = articulation_flow(stage.tree, world, link, torch.from_numpy(poses[: len(stage.links)]), direction)
         valid = link >= 0
         return {
             "points": world,

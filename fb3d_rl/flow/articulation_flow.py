@@ -2,54 +2,49 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.geometry.transforms import inverse
 
 STEP = 0.01
 """Displacement of the joint, rad or m."""
 
 
-def articulation_flow(
-    tree: KinematicTree, points: Tensor, links: Tensor, qpos: Tensor, direction: Tensor, base: Tensor
-) -> Tensor:
+def articulation_flow(tree: KinematicTree, points: Tensor, links: Tensor, poses: Tensor, direction: Tensor) -> Tensor:
     """Displacement of world points when the joints move by ``STEP * direction``.
 
     As the supplement's II.B has it: take the kinematic chain at the current joint state, displace the joint, transform
-    the points of the parts that move (all that the joint carries), and take the difference. A finite step chords a
-    revolute joint's arc, so the displacement is measured over half a step each way: its error is of the third order.
-    Where several joints move at once (all movable parts), a point gets the sum of the displacements of all the
-    joints that carry it.
+    the points of the parts that move (all that the joint carries), and take the difference. A step to one side would
+    cut across a revolute joint's arc, so the difference is taken over half a step each way, along the tangent. It has a
+    closed form: ``2 sin(STEP / 2) a x (p - o)`` for a joint that turns about the unit axis a through o (Rodrigues'
+    formula, in which the terms with the cosine cancel), ``STEP a`` for one that slides. Where several joints move at
+    once (all movable parts), a point gets the sum of the displacements of all the joints that carry it.
 
     Args:
         tree: the object's kinematic tree with L links and J joints.
-        points: [..., N, 3] world points (m) on the object in the state ``qpos``.
+        points: [..., N, 3] world points (m) on the object.
         links: [..., N] int64, the link of each point; points with -1 (padding) get 0.
-        qpos: [..., J] joint state (rad or m).
+        poses: T_world_link [..., L, 4, 4] of the links now.
         direction: [..., J] signs: +1 or -1 for the joints that move, towards opening, and 0 for the others.
-        base: T_world_base [..., 4, 4].
 
     Returns:
         [..., N, 3] displacement in metres for each point, in the dtype of ``points``.
     """
-    dtype = tree.origins.dtype
-    base, world = base.to(dtype), points.to(dtype)
-    half = 0.5 * STEP * direction.to(dtype)
-    position = qpos.to(dtype)
-    poses = base[..., None, :, :] @ tree.forward(torch.stack([position, position + half, position - half]))
-    # T_world_link(q +- half) T_world_link(q)^-1 moves a world point along with its link.
-    at_rest = inverse(poses[0])
-    ahead, behind = poses[1] @ at_rest, poses[2] @ at_rest
-    change = ahead - behind  # [..., L, 4, 4], exactly 0 for links that stand still
-    index = links.clamp_min(0)[..., None, None].expand(*links.shape, 4, 4)
-    per_point = change.gather(-3, index)
-    flow = (per_point[..., :3, :3] * world[..., None, :]).sum(-1) + per_point[..., :3, 3]
-    return torch.where((links >= 0)[..., None], flow, torch.zeros_like(flow)).to(points.dtype)
+    dtype = tree.axes.dtype
+    frames = poses.index_select(-3, tree.movable).to(dtype)
+    turn, slide = (frames[..., :3, :3] @ tree.screws * direction.to(dtype)[..., None, None]).unbind(-1)
+    turn = 2.0 * math.sin(0.5 * STEP) * turn
+    # Each joint's displacement turn x p + offset, [..., J, 6], and its sum over the joints that carry a link.
+    offset = STEP * slide - torch.linalg.cross(turn, frames[..., :3, 3])
+    per_link = tree.carried @ torch.cat([turn, offset], dim=-1)
+    turn, offset = per_link.gather(-2, (links + 1)[..., None].expand(*links.shape, 6)).split(3, dim=-1)
+    return (torch.linalg.cross(turn, points.to(dtype)) + offset).to(points.dtype)
 
 
 def normalize_flow(flow: Tensor, eps: float = 1e-9) -> Tensor:
     """Scale each cloud's flow [..., N, 3] so that its largest norm is 1; a cloud that does not move stays 0."""
-    largest = flow.norm(dim=-1).amax(dim=-1)[..., None, None]
-    return torch.where(largest > eps, flow / largest.clamp_min(eps), torch.zeros_like(flow))
+    largest = torch.linalg.vector_norm(flow, dim=-1).amax(dim=-1)[..., None, None]
+    return flow / torch.where(largest > eps, largest, torch.inf)

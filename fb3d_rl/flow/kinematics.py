@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.geometry.transforms import axis_angle_to_matrix, rigid
@@ -19,9 +21,10 @@ class KinematicTree:
     Attributes:
         parents: parent's index of each link, -1 for the root.
         origins: T_parent_joint [L, 4, 4] at joint position 0.
-        axes: unit joint axes [L, 3] in the joint's frame.
+        axes: unit joint axes [L, 3] in the joint's frame, which is the link's.
         joint_index: position of each link's joint in a joint state, -1 for a fixed joint and the root.
         prismatic: whether each link's joint slides.
+        movable: the link of each joint of a joint state [J], int64.
         descendants: [J, L] bool, the links that joint j moves (its own link and all that it carries).
     """
 
@@ -30,6 +33,7 @@ class KinematicTree:
     axes: Tensor
     joint_index: tuple[int, ...]
     prismatic: tuple[bool, ...]
+    movable: Tensor
     descendants: Tensor
 
     @classmethod
@@ -50,8 +54,21 @@ class KinematicTree:
             ),
             joint_index=tuple(order.get(i, -1) for i in range(len(obj.links))),
             prismatic=tuple(joint is not None and joint.type == "prismatic" for joint in joints),
+            movable=torch.tensor(obj.movable, dtype=torch.int64),
             descendants=descendants,
         )
+
+    @cached_property
+    def screws(self) -> Tensor:
+        """Axes [J, 3, 2] of joints that turn (first column) and that slide (second column) in their links' frames."""
+        slides = torch.tensor(self.prismatic, device=self.axes.device)[self.movable, None]
+        axes = self.axes[self.movable]
+        return torch.stack([axes.masked_fill(slides, 0.0), axes.masked_fill(~slides, 0.0)], dim=-1)
+
+    @cached_property
+    def carried(self) -> Tensor:
+        """[1 + L, J], 1 where joint j moves link i at row i + 1: row 0 is for points without a link (-1)."""
+        return functional.pad(self.descendants.mT, (0, 0, 1, 0)).to(self.axes.dtype)
 
     def forward(self, qpos: Tensor) -> Tensor:
         """Link poses T_base_link [..., L, 4, 4] at joint states ``qpos`` [..., J] (rad or m)."""

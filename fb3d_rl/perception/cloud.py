@@ -23,9 +23,9 @@ def sample_cloud(
     Returns:
         Points [N, 3] float32 and their links [N] int64; padding has the point 0 and the link -1.
     """
-    order = rng.permutation(len(points))[:count]
+    order = rng.choice(len(points), min(count, len(points)), replace=False)
     cloud = np.zeros((count, 3), dtype=np.float32)
     ids = np.full(count, -1, dtype=np.int64)
-    cloud[: len(order)] = points[order]
-    ids[: len(order)] = links[order]
+    cloud[: len(order)] = points.take(order, axis=0)
+    ids[: len(order)] = links.take(order)
     return cloud, ids

@@ -17,6 +17,7 @@ from .chains import pose, random_chain
 
 # A chord is shorter than its arc by STEP^2 / 24, some 4e-6 of the displacement of at most 0.1 m in these scenes.
 ATOL = 1e-6
+EXACT = 1e-14
 
 
 class Scene:
@@ -31,8 +32,11 @@ class Scene:
         self.points = torch.as_tensor(self.rng.normal(size=(count, 3)))
         self.links = torch.as_tensor(self.rng.integers(-1, len(self.obj.links), size=count))
 
+    def poses(self, qpos: Tensor) -> Tensor:
+        return self.base @ self.tree.forward(qpos)
+
     def flow(self, direction: Tensor) -> Tensor:
-        return articulation_flow(self.tree, self.points, self.links, self.qpos, direction, self.base)
+        return articulation_flow(self.tree, self.points, self.links, self.poses(self.qpos), direction)
 
     def one(self, joint: int, sign: float = 1.0) -> Tensor:
         direction = torch.zeros(len(self.obj.movable), dtype=torch.float64)
@@ -83,16 +87,15 @@ def test_several_joints_add_up(seed: int) -> None:
 def test_flow_is_the_finite_difference_of_forward_kinematics(seed: int) -> None:
     scene = Scene(seed)
     scene.links.clamp_(min=0)
-    rest = inverse(scene.tree.forward(scene.qpos))
-    local = apply(rest[scene.links] @ inverse(scene.base), scene.points[:, None])
+    local = apply(inverse(scene.poses(scene.qpos))[scene.links], scene.points[:, None])
     for j in range(len(scene.obj.movable)):
         direction = scene.one(j)
-        small = 1e-5
-        ends = [
-            apply(scene.base @ scene.tree.forward(scene.qpos + sign * small * direction)[scene.links], local).squeeze(1)
-            for sign in (1, -1)
-        ]
-        close(scene.flow(direction), (ends[0] - ends[1]) * (STEP / (2 * small)))
+        for step, atol in ((STEP, EXACT), (1e-5, ATOL)):  # the same step, to the last digit, and a small one
+            ends = [
+                apply(scene.poses(scene.qpos + sign * 0.5 * step * direction)[scene.links], local).squeeze(1)
+                for sign in (1, -1)
+            ]
+            close(scene.flow(direction), (ends[0] - ends[1]) * (STEP / step), atol=atol)
 
 
 def test_flow_of_a_hinge_is_across_axis_and_radius_and_grows_with_it() -> None:
@@ -127,18 +130,16 @@ def test_opposite_directions_give_opposite_flows() -> None:
 def test_batches_equal_single_clouds() -> None:
     scene = Scene(8)
     rng = scene.rng
-    qpos = torch.as_tensor(rng.normal(size=(4, len(scene.obj.movable))))
+    qpos = torch.as_tensor(rng.normal(size=(4, 2, len(scene.obj.movable))))
     direction = torch.as_tensor(rng.choice([-1.0, 0.0, 1.0], size=qpos.shape))
-    points = torch.as_tensor(rng.normal(size=(4, 20, 3)))
-    links = torch.as_tensor(rng.integers(-1, len(scene.obj.links), size=(4, 20)))
-    base = torch.stack([torch.as_tensor(pose(rng.normal(size=3), Rotation.random(rng=rng))) for _ in range(4)])
-    batched = articulation_flow(scene.tree, points, links, qpos, direction, base)
-    shared = articulation_flow(scene.tree, points, links, qpos, direction, base[0])
-    for i in range(4):
-        one = articulation_flow(scene.tree, points[i], links[i], qpos[i], direction[i], base[i])
-        close(batched[i], one, atol=1e-14)
-        other = articulation_flow(scene.tree, points[i], links[i], qpos[i], direction[i], base[0])
-        close(shared[i], other, atol=1e-14)
+    points = torch.as_tensor(rng.normal(size=(4, 2, 20, 3)))
+    links = torch.as_tensor(rng.integers(-1, len(scene.obj.links), size=(4, 2, 20)))
+    base = [torch.as_tensor(pose(rng.normal(size=3), Rotation.random(rng=rng))) for _ in range(4)]
+    poses = torch.stack(base)[:, None, None] @ scene.tree.forward(qpos)
+    batched = articulation_flow(scene.tree, points, links, poses, direction)
+    for i in np.ndindex(4, 2):
+        one = articulation_flow(scene.tree, points[i], links[i], poses[i], direction[i])
+        close(batched[i], one, atol=EXACT)
 
 
 def test_dtype_is_that_of_the_points_and_precision_that_of_the_tree() -> None:

@@ -19,6 +19,15 @@ def test_draws_exactly_n_without_repeats() -> None:
 def test_pads_and_marks_what_is_missing() -> None:
     cloud, ids = sample_cloud(np.ones((5, 3)), np.full(5, 2), 8, np.random.default_rng(0))
     assert (ids >= 0).sum() == 5 and np.array_equal(cloud[ids < 0], np.zeros((3, 3)))
+    cloud, ids = sample_cloud(np.zeros((0, 3)), np.zeros(0, dtype=np.int64), 4, np.random.default_rng(0))
+    assert np.array_equal(cloud, np.zeros((4, 3))) and (ids == -1).all()
+
+
+def test_every_point_and_every_order_is_as_likely() -> None:
+    links, rng, runs = np.arange(6), np.random.default_rng(0), 4000
+    drawn = np.stack([sample_cloud(np.zeros((6, 3)), links, 3, rng)[1] for _ in range(runs)])
+    for place in range(3):
+        np.testing.assert_allclose(np.bincount(drawn[:, place], minlength=6) / runs, 1 / 6, atol=0.03)
 
 
 def test_is_repeatable() -> None:
