@@ -54,8 +54,7 @@ class OpenArticulatedEnv(BaseEnv):
     A floating suction gripper, commanded by eight velocities, opens the given part (a door, a drawer, a lid ...) of an
     object whose base is fixed. It sees the object as a cloud of points from one camera. Suction holds the part as
     soon as a finger touches it. Contact between gripper, object and ground is physical; the object's parts do not
-    collide with each other. The collision shape of a part is the convex hull of each of its collision meshes, but for
-    hollow bodies such as a pot (``options.hollow``).
+    collide with each other. What cannot move collides as the surface of its meshes, what moves as their convex hulls.
 
     **Randomizations:**
     None of its own: a :class:`~fb3d_rl.env.options.Trial`, handed to ``reset(options={"trial": trial})``, fixes the
@@ -92,7 +91,6 @@ class OpenArticulatedEnv(BaseEnv):
         self.options = options or EnvOptions()
         self.trial = default_trial(next(iter(self.objects.values())))
         self._cameras: dict[str, RaycastCamera] = {}
-        self._hollow: dict[str, frozenset[tuple[int, int]]] = {}
         super().__init__(
             robot_uids=FloatingSuctionGripper.uid,
             sim_config=dict(sim_freq=self.options.sim_freq, control_freq=self.options.control_freq),
@@ -165,9 +163,7 @@ class OpenArticulatedEnv(BaseEnv):
         self.articulation = _build(self, self.object, base, self.options)
         links = self.articulation.links_map
         self._links: list[PhysxArticulationLinkComponent] = [links[link.name]._objs[0] for link in self.object.links]
-        if self.object.id not in self._hollow:
-            self._hollow[self.object.id] = _hollow_meshes(self.object, self.tree, self.options.hollow)
-        self._static = _add_shapes(self.object, self._links, self._hollow[self.object.id], self.options.density)
+        self._static = _add_shapes(self.object, self._links, self.tree, base, self.options.density)
         entity = sapien.Entity()
         entity.add_component(self._static)
         self.scene.sub_scenes[0].add_entity(entity)
@@ -350,63 +346,35 @@ def _build(env: OpenArticulatedEnv, obj: ArticulatedObject, base: NDArray[np.flo
     return articulation
 
 
-def _hollow_meshes(obj: ArticulatedObject, tree: KinematicTree, fraction: float) -> frozenset[tuple[int, int]]:
-    """(link, collision mesh) of what cannot move and whose hull covers more than ``fraction`` of a closed part."""
-    closed, _ = opening_range(obj)
-    poses = tree.forward(torch.as_tensor(closed)).numpy()
-
-    def in_base(link: int, mesh: Mesh) -> NDArray[np.float64]:
-        return np.asarray(mesh.vertices @ poses[link, :3, :3].T + poses[link, :3, 3])
-
-    moves = tree.descendants.any(0).tolist()
-    parts = [
-        np.concatenate([in_base(i, mesh) for mesh in link.visuals])
-        for i, link in enumerate(obj.links)
-        if moves[i] and link.visuals
-    ]
-    found = set()
-    for i, link in enumerate(obj.links):
-        for k, mesh in enumerate(() if moves[i] else link.collisions):
-            points = in_base(i, mesh)
-            low, high = points.min(0), points.max(0)
-            # Cheap test first: most meshes are boards, whose bounding box holds no part.
-            boxed = [part for part in parts if ((part > low) & (part < high)).all(-1).mean() > fraction]
-            if boxed:
-                hull = PhysxCollisionShapeConvexMesh(points.astype(np.float32), [1.0, 1.0, 1.0], get_default_material())
-                corners = hull.vertices[hull.triangles]
-                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-                heights = (normals * corners[:, 0]).sum(-1)
-                outward = np.sign(heights - normals @ hull.vertices.mean(0))
-                covered = [((part @ normals.T - heights) * outward < 0).all(-1).mean() for part in boxed]
-                if max(covered) > fraction:
-                    found.add((i, k))
-    return frozenset(found)
-
-
 def _add_shapes(
     obj: ArticulatedObject,
     links: Sequence[PhysxArticulationLinkComponent],
-    hollow: frozenset[tuple[int, int]],
+    tree: KinematicTree,
+    base: NDArray[np.float64],
     density: float,
 ) -> PhysxRigidStaticComponent:
-    """Give the links the convex hull of each collision mesh; the result has the hollow ones, as surfaces.
+    """Give the links that move the convex hull of each collision mesh; the result has the others, as surfaces.
 
-    Only a static body can have a surface as its shape.
+    The hull of a hollow body (a pot, a frame, a cabinet) closes it, so that parts within could be seen but not touched.
+    The physics engine takes surfaces of static bodies only.
     """
     static = PhysxRigidStaticComponent()
     material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
+    moves = tree.descendants.any(0).tolist()
+    # Not the components' own poses: the simulator has not worked them out yet.
+    poses = base @ tree.forward(torch.zeros(len(obj.movable))).numpy()
     for i, (link, component) in enumerate(zip(obj.links, links, strict=True)):
-        for k, mesh in enumerate(link.collisions):
+        for mesh in link.collisions:
             vertices = mesh.vertices.astype(np.float32)
-            if (i, k) in hollow:
+            if not moves[i]:
                 shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
-                shape.local_pose = component.entity_pose
+                shape.local_pose = sapien.Pose(poses[i])
             else:
                 # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
                 shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
                 shape.set_density(density)
             shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
-            (static if (i, k) in hollow else component).attach(shape)
+            (component if moves[i] else static).attach(shape)
     return static
 
 
