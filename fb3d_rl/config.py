@@ -124,7 +124,6 @@ class EnvConfig:
     joint_friction: float
     joint_damping: float
     density: float
-    hollow: float
     gripper: GripperConfig
     suction: SuctionConfig
 

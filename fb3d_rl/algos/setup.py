@@ -83,7 +83,6 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
         joint_friction=env.joint_friction,
         joint_damping=env.joint_damping,
         density=env.density,
-        hollow=env.hollow,
         camera=camera_options(cfg),
     )
 

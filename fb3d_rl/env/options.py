@@ -88,9 +88,6 @@ class EnvOptions:
             weigh from grams to 100 kg: light ones stay easy to open and heavy ones do not coast on after a push.
         density: of the object's parts, kg/m^3. Parts are hollow, but their hulls are solid and overlap: at the density
             of wood a wide drawer would weigh 600 kg.
-        hollow: a mesh that cannot move collides as its surface, and not as its convex hull, if the hull covers more
-            than this fraction of a movable part: a pot's hull is closed, so the lid within could not be touched.
-            1 keeps every hull.
     """
 
     gripper: GripperOptions = field(default_factory=GripperOptions)
@@ -107,7 +104,6 @@ class EnvOptions:
     joint_friction: float = 0.1
     joint_damping: float = 5.0
     density: float = 100.0
-    hollow: float = 0.5
 
 
 @dataclass(frozen=True)

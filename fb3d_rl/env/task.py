@@ -29,7 +29,7 @@ from sapien.physx import (
 )
 from torch import Tensor
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint
 from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.contract import ACTION_DIM, UserError
@@ -81,9 +81,42 @@ class Model:
         return RaycastCamera(self.object, gripper_meshes(), self._options.camera)
 
     @cached_property
-    def hollow(self) -> frozenset[tuple[int, int]]:
-        """(link, collision mesh) of what collides as a surface."""
-        return _hollow_meshes(self.object, self.tree, self._options.hollow)
+    def shapes(self) -> list[list[Any]]:
+        """Collision shapes of each link [L], cooked once: making them anew takes longer than the rest of a reset.
+
+        What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
+        move as their surface, placed in the world: a hull would close hollow bodies.
+        """
+        material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
+        moves = self.tree.descendants.any(0).tolist()
+        poses = self.poses(np.zeros(len(self.object.movable)))
+        shapes: list[list[Any]] = []
+        for link, pose, moving in zip(self.object.links, poses, moves, strict=True):
+            shapes.append([])
+            for mesh in link.collisions:
+                vertices = mesh.vertices.astype(np.float32)
+                if moving:
+                    # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
+                    shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
+                    shape.set_density(self._options.density)
+                else:
+                    shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
+                    shape.local_pose = sapien.Pose(pose)
+                shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
+                shapes[-1].append(shape)
+        return shapes
+
+    def add_shapes(self, links: Sequence[PhysxArticulationLinkComponent]) -> PhysxRigidStaticComponent:
+        """Give the links their shapes; the result has those of what does not move.
+
+        Only a static body can have a surface as its shape.
+        """
+        static = PhysxRigidStaticComponent()
+        moves = self.tree.descendants.any(0).tolist()
+        for component, shapes, moving in zip(links, self.shapes, moves, strict=True):
+            for shape in shapes:
+                (component if moving else static).attach(shape)
+        return static
 
     def poses(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
         """T_world_link [L, 4, 4] at a joint state [J]."""
@@ -118,6 +151,7 @@ class Stage:
         scene: the environment's own scene.
         links: the object's links in the simulator, in the order of ``object.links``.
         order: column of each of the J joints in the simulator's joint state.
+        static: what of the object collides as a surface.
         bodies: the gripper's links that have a shape.
         suction: holds the part.
     """
@@ -125,6 +159,7 @@ class Stage:
     scene: sapien.Scene
     links: list[PhysxArticulationLinkComponent]
     order: list[int]
+    static: PhysxRigidStaticComponent
     bodies: list[PhysxArticulationLinkComponent]
     suction: Suction
 
@@ -154,7 +189,7 @@ class Stage:
     def place(self, trial: Trial) -> Stage:
         """Another trial with the object that is built here already."""
         stage = Stage(trial, self.model)
-        for name in ("scene", "links", "order", "bodies", "suction"):
+        for name in ("scene", "links", "order", "static", "bodies", "suction"):
             setattr(stage, name, getattr(self, name))
         return stage
 
@@ -180,8 +215,7 @@ class OpenArticulatedEnv(BaseEnv):
     A floating suction gripper, commanded by eight velocities, opens the given part (a door, a drawer, a lid ...) of an
     object whose base is fixed. It sees the object as a cloud of points from one camera. Suction holds the part as
     soon as a finger touches it. Contact between gripper, object and ground is physical; the object's parts do not
-    collide with each other. The collision shape of a part is the convex hull of each of its collision meshes, but for
-    hollow bodies such as a pot (``options.hollow``).
+    collide with each other. What cannot move collides as the surface of its meshes, what moves as their convex hulls.
 
     **Randomizations:**
     - the object, and which of its parts is to be opened (``link`` fixes the part)
@@ -363,9 +397,9 @@ class OpenArticulatedEnv(BaseEnv):
             active = [joint.child_link.name for joint in articulation.active_joints]
             stage.order = [active.index(stage.object.links[i].name) for i in stage.object.movable]
             stage.bodies = [own[name]._objs[e] for name in BODIES]
-            static = _add_shapes(stage.object, stage.links, stage.model.hollow, self.options.density)
+            stage.static = stage.model.add_shapes(stage.links)
             entity = sapien.Entity()
-            entity.add_component(static)
+            entity.add_component(stage.static)
             stage.scene.add_entity(entity)
         self._built = built
         # One view of all objects, whose joint states are padded to the longest.
@@ -639,66 +673,6 @@ def _build(
         joint.set_friction(o.joint_friction)
         joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
     return articulation
-
-
-def _hollow_meshes(obj: ArticulatedObject, tree: KinematicTree, fraction: float) -> frozenset[tuple[int, int]]:
-    """(link, collision mesh) of what cannot move and whose hull covers more than ``fraction`` of a closed part."""
-    closed, _ = opening_range(obj)
-    poses = tree.forward(torch.as_tensor(closed)).numpy()
-
-    def in_base(link: int, mesh: Mesh) -> NDArray[np.float64]:
-        return np.asarray(mesh.vertices @ poses[link, :3, :3].T + poses[link, :3, 3])
-
-    moves = tree.descendants.any(0).tolist()
-    parts = [
-        np.concatenate([in_base(i, mesh) for mesh in link.visuals])
-        for i, link in enumerate(obj.links)
-        if moves[i] and link.visuals
-    ]
-    found = set()
-    for i, link in enumerate(obj.links):
-        for k, mesh in enumerate(() if moves[i] else link.collisions):
-            points = in_base(i, mesh)
-            low, high = points.min(0), points.max(0)
-            # Cheap test first: most meshes are boards, whose bounding box holds no part.
-            boxed = [part for part in parts if ((part > low) & (part < high)).all(-1).mean() > fraction]
-            if boxed:
-                hull = PhysxCollisionShapeConvexMesh(points.astype(np.float32), [1.0, 1.0, 1.0], get_default_material())
-                corners = hull.vertices[hull.triangles]
-                normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-                heights = (normals * corners[:, 0]).sum(-1)
-                outward = np.sign(heights - normals @ hull.vertices.mean(0))
-                covered = [((part @ normals.T - heights) * outward < 0).all(-1).mean() for part in boxed]
-                if max(covered) > fraction:
-                    found.add((i, k))
-    return frozenset(found)
-
-
-def _add_shapes(
-    obj: ArticulatedObject,
-    links: Sequence[PhysxArticulationLinkComponent],
-    hollow: frozenset[tuple[int, int]],
-    density: float,
-) -> PhysxRigidStaticComponent:
-    """Give the links the convex hull of each collision mesh; the result has the hollow ones, as surfaces.
-
-    Only a static body can have a surface as its shape.
-    """
-    static = PhysxRigidStaticComponent()
-    material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
-    for i, (link, component) in enumerate(zip(obj.links, links, strict=True)):
-        for k, mesh in enumerate(link.collisions):
-            vertices = mesh.vertices.astype(np.float32)
-            if (i, k) in hollow:
-                shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
-                shape.local_pose = component.entity_pose
-            else:
-                # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
-                shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
-                shape.set_density(density)
-            shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
-            (static if (i, k) in hollow else component).attach(shape)
-    return static
 
 
 def _axis_frame(joint: Joint) -> NDArray[np.float64]:

@@ -46,7 +46,9 @@ class FlowPolicyOptions:
         force: contact force (N) that ends an approach which does not hold.
         patience: control steps for which that force is borne, since suction may still engage.
         retry_distance: points nearer (m) than this to a point tried in vain are not tried.
-        neighbors: nearest moving points whose mean flow is the flow at the held point.
+        nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
+        lead: how far ahead (s) of the observation the flow is read along the part's motion: half a control step, so
+            that the tip moves on the chord of its arc and does not drift outwards.
         hand_length: from the tip to the hand's far end, m.
         clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
             between itself and the ground z = 0.
@@ -63,7 +65,8 @@ class FlowPolicyOptions:
     force: float = 20.0
     patience: int = 4
     retry_distance: float = 0.08
-    neighbors: int = 8
+    nearby: float = 0.1
+    lead: float = 0.025
     hand_length: float = 0.2
     clearance: float = 0.08
     margin: float = 0.1
@@ -132,12 +135,12 @@ class FlowPolicy(TensorDictModuleBase):
         phase = state["phase"]
         velocity = self._path_velocity(state, obs, tip)
         pull = self._flow_at(obs, flow, tip, state["pull"])
+        # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
+        turned = rotation_vector_to_matrix(alignment(state["pull"], pull)) @ state["standoff"][..., None]
+        state["standoff"] = torch.where(phase == PULL, turned.squeeze(-1), state["standoff"])
         state["pull"] = torch.where(phase == PULL, pull, state["contact_flow"])
-        velocity = torch.where(phase == PULL, o.pull_speed * normalize(pull), velocity)
-
-        # The hand keeps its angle to the flow: what turns the flow at contact into the flow now turns the hand.
-        turned = rotation_vector_to_matrix(alignment(state["contact_flow"], state["pull"]))
-        wanted = self._above_ground((turned @ state["standoff"][..., None]).squeeze(-1), tip)
+        velocity = torch.where(phase == PULL, o.pull_speed * pull, velocity)
+        wanted = self._above_ground(state["standoff"], tip)
         angular = o.angular_gain * alignment(hand, wanted)
         tensordict["action"] = self._joint_velocities(obs, tip, hand, velocity, angular)
         tensordict["next", "policy"] = state
@@ -162,6 +165,7 @@ class FlowPolicy(TensorDictModuleBase):
         failed = (phase == APPROACH) & ((count > o.patience) | (height < -o.overshoot)) & ~attached
         lost = (phase == PULL) & ~attached
         given_up = failed | lost
+        state["contact_point"] = torch.where(lost[:, None], tip, state["contact_point"])
         slot = (state["tries"] % TRIES)[..., None].expand(-1, 1, 3)
         remembered = state["tried"].scatter(1, slot, state["contact_point"][:, None])
         state["tried"] = torch.where(failed[:, None, None], remembered, state["tried"])
@@ -237,16 +241,30 @@ class FlowPolicy(TensorDictModuleBase):
         return speed * step
 
     def _flow_at(self, obs: TensorDictBase, flow: Tensor, tip: Tensor, last: Tensor) -> Tensor:
-        """Unit flow [E, 3] at the held point: mean over the nearest moving points; the last one where none is seen."""
-        norm = flow.norm(dim=-1)
-        moving = norm > 0.1 * norm.amax(-1, keepdim=True).clamp_min(1e-6)
-        distance = (obs["points"] - tip[:, None]).norm(dim=-1)
-        distance = torch.where(moving, distance, torch.inf)
-        nearest = distance.topk(min(self.options.neighbors, distance.shape[-1]), largest=False)
-        use = torch.isfinite(nearest.values)[..., None]
-        near_flow = flow.gather(1, nearest.indices[..., None].expand(-1, -1, 3))
-        mean = normalize(torch.where(use, near_flow, 0.0).sum(1))
-        return torch.where(mean.norm(dim=-1, keepdim=True) > 0, mean, last)
+        """Unit flow [E, 3] at the held point, ``lead`` ahead; the last one where none is seen.
+
+        The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the
+        near ones foremost: the hand often hides those around the held point.
+        """
+        o = self.options
+        arm = obs["points"] - tip[:, None]
+        weight = (obs["part_mask"] & obs["valid"]) / (1.0 + arm.square().sum(-1) / o.nearby**2)
+        weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
+        weighted = weight * arm
+        mean_arm, mean_flow = weighted.sum(1), (weight * flow).sum(1)
+        # The normal equations of omega, v eliminated: the inertia of the points about their mean, and their moment.
+        eye = torch.eye(3, dtype=flow.dtype, device=flow.device)
+        spread = weighted.mT @ arm - mean_arm[..., :, None] * mean_arm[..., None, :]
+        trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+        # A little of the identity keeps omega from running away where few points lie in a row.
+        inertia = (trace + 1e-2 * o.nearby**2) * eye - spread
+        moment = torch.linalg.cross(weighted, flow).sum(1) - torch.linalg.cross(mean_arm, mean_flow)
+        omega = torch.linalg.solve(inertia, moment)
+        at_tip = mean_flow - torch.linalg.cross(omega, mean_arm)
+        speed = at_tip.norm(dim=-1, keepdim=True)
+        rate = o.lead * o.pull_speed * omega / speed.clamp_min(1e-6)
+        ahead = normalize(at_tip) + torch.linalg.cross(rate, normalize(at_tip))
+        return torch.where(speed > 1e-6, normalize(ahead), last)
 
     def _above_ground(self, axis: Tensor, tip: Tensor) -> Tensor:
         """Lift unit hand axes [E, 3] that would take the hand's far end below ``clearance``."""

@@ -14,7 +14,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from tensordict import TensorDict
 
 from fb3d_rl import contract
-from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.articulation import ArticulatedObject, Link, Mesh
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
@@ -338,3 +338,46 @@ def test_a_trial_that_is_won_from_the_start_is_refused(
 def test_an_environment_without_objects_is_refused() -> None:
     with pytest.raises(UserError, match="object"):
         OpenArticulatedEnv([])
+
+
+def test_what_cannot_move_collides_where_it_is_seen(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    for obj in objects.values():
+        env.reset(options={"trials": [default_trial(obj)]})
+        seen = [
+            mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+            for i, (link, pose) in enumerate(zip(obj.links, poses(env), strict=True))
+            for mesh in link.collisions
+            if not env.stages[0].tree.descendants[:, i].any()
+        ]
+        box = env.stages[0].static.compute_global_aabb_tight()
+        vertices = np.concatenate(seen)
+        np.testing.assert_allclose(box, [vertices.min(0), vertices.max(0)], atol=1e-4)
+
+
+def merged(link: Link) -> tuple[Mesh, ...]:
+    """The link's collision meshes as one: its hull closes every hollow."""
+    if not link.collisions:
+        return ()
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in link.collisions)])
+    faces = [mesh.faces + start for mesh, start in zip(link.collisions, starts, strict=False)]
+    return (Mesh(np.concatenate([mesh.vertices for mesh in link.collisions]), np.concatenate(faces)),)
+
+
+def test_the_hand_reaches_into_a_hollow_body_but_not_through_its_walls(objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["Oven"]
+    obj = dataclasses.replace(obj, links=tuple(dataclasses.replace(x, collisions=merged(x)) for x in obj.links))
+    env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS))
+    door = links_called(obj, "door")[0]
+    env.reset(options={"trials": [default_trial(obj, door)]})
+    state = torch.as_tensor(np.where(np.array(obj.movable) == door, obj.limits[:, 1], env.stages[0].trial.start))
+    set_joints(env, state)  # the door is open
+    (front, _, _), (back, _, top) = env.stages[0].static.compute_global_aabb_tight()
+    hand = torch.zeros(1, 8)
+    hand[0, 0], hand[0, 2] = float(front) - 0.4, 0.5 * float(top)
+    env.agent.robot.set_qpos(hand)
+    for _ in range(40):
+        env.step(velocity(x=2.0))
+    tip = float(env.agent.tool_pose()[0, 0])
+    assert front + 0.1 < tip < back

@@ -202,3 +202,44 @@ def test_flowbot3d_sees_nothing_privileged_and_the_expert_differs_by_its_flow_al
     td["prediction", "flow"] = td["privileged", "flow"]
     same = FlowPolicy(("prediction", "flow"), LIMITS)(td.clone())["action"]
     assert torch.equal(same, expert_policy(LIMITS)(td)["action"])
+
+
+def test_the_flow_at_the_held_point_is_read_from_the_part_s_motion_where_the_hand_hides_it() -> None:
+    policy, door = expert_policy(LIMITS, FlowPolicyOptions(lead=0.0)), ToyDoor()
+    door.opened = 0.7
+    td = door.observe(policy.initial_state((1,)))
+    points, flow = td["observation", "points"], td["privileged", "flow"]
+    index = int(points[0, :, 1].argmin())
+    seen = ((points - points[:, index : index + 1]).norm(dim=-1) > 0.25)[0]
+    observed = {"points": points[:, seen], "part_mask": torch.ones(1, int(seen.sum()), dtype=torch.bool)}
+    observed["valid"] = observed["part_mask"]
+    found = policy._flow_at(TensorDict(observed, [1]), flow[:, seen], points[:, index], torch.zeros(1, 3))
+    assert torch.allclose(found, flow[:, index] / flow[:, index].norm(), atol=0.02)
+    nothing = policy._flow_at(TensorDict(observed, [1]), torch.zeros_like(flow[:, seen]), points[:, index], found)
+    assert torch.equal(nothing, found), "where no flow is seen the last one counts"
+
+
+def test_a_door_is_opened_by_half_a_turn_without_drifting_off_the_held_point() -> None:
+    door = ToyDoor()
+    rollout(door, expert_policy(LIMITS), until=3.0)
+    assert door.opened >= 3.0
+    away = -euler_xyz_to_matrix(door.qpos[:, 3:6])[0, :, 0]
+    normal = torch.tensor([-math.cos(door.opened), math.sin(door.opened), 0.0])
+    assert away @ normal > 0.9, "the hand turned with the door, and not back where the flow had turned by more than pi"
+    assert float((door.tip() - door.points()[door.held]).norm()) < 0.03
+
+
+def test_a_hand_that_lost_hold_backs_off_from_there() -> None:
+    policy, door = expert_policy(LIMITS), ToyDoor()
+    state, phases = policy.initial_state((1,)), []
+    for step in range(150):
+        td = policy(door.observe(state))
+        state = td["next", "policy"]
+        phases.append(int(state["phase"]))
+        door.step(td["action"])
+        if door.opened > 1.0 and RETREAT not in phases:
+            door.held, lost = None, step
+        if phases[-1] == RETREAT:
+            backing = step
+    assert backing - lost < 8, "10 cm at 1 m/s, wherever the first contact was"
+    assert PULL in phases[backing:]
