@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import warnings
 from collections.abc import Iterable, Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,189 +18,23 @@ from mani_skill.utils.registration import register
 from mani_skill.utils.structs import Articulation
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from numpy.typing import NDArray
-from sapien.physx import (
-    PhysxArticulationLinkComponent,
-    PhysxCollisionShapeConvexMesh,
-    PhysxCollisionShapeTriangleMesh,
-    PhysxRigidStaticComponent,
-    get_default_material,
-)
 from torch import Tensor
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Joint
+from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import find_objects
-from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.contract import ACTION_DIM, UserError
-from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper, gripper_meshes
+from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
+from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage
 from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
-from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
-
-OBJECT_BIT = 30
-"""Bit of collision group 2 that the object's links and the ground share, so that they do not collide.
-
-Parts of real objects overlap at rest and hulls overlap even more, so contact among them would jam every joint; and
-an object that stands on the ground would rub on it. The gripper has no such bit: it touches all of them.
-"""
 
 TASK = "OpenArticulated-v1"
 """The task's name for ``gymnasium.make``."""
 
 VIEW_TRIES = 8
 """Views that are drawn at most until one shows the part to open."""
-
-
-class Model:
-    """What is computed of an object once, however often it is built into a scene.
-
-    Attributes:
-        object: the object.
-        tree: its kinematic tree.
-        closed: joint state [J] in which everything is closed.
-        opened: joint state [J] in which everything is open.
-        T_world_base: pose [4, 4] that stands it on the ground.
-        links: what of it can be opened.
-    """
-
-    def __init__(self, obj: ArticulatedObject, options: EnvOptions) -> None:
-        self.object = obj
-        self.tree = KinematicTree.from_object(obj)
-        self.closed, self.opened = opening_range(obj)
-        self.T_world_base = standing_pose(obj)
-        self.links = openable_links(obj)
-        self._options = options
-
-    @cached_property
-    def camera(self) -> RaycastCamera:
-        """Sees the object's links and then the gripper's bodies."""
-        return RaycastCamera(self.object, gripper_meshes(), self._options.camera)
-
-    @cached_property
-    def shapes(self) -> list[list[Any]]:
-        """Collision shapes of each link [L], cooked once: making them anew takes longer than the rest of a reset.
-
-        What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
-        move as their surface, placed in the world: a hull would close hollow bodies.
-        """
-        material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
-        moves = self.tree.descendants.any(0).tolist()
-        poses = self.poses(np.zeros(len(self.object.movable)))
-        shapes: list[list[Any]] = []
-        for link, pose, moving in zip(self.object.links, poses, moves, strict=True):
-            shapes.append([])
-            for mesh in link.collisions:
-                vertices = mesh.vertices.astype(np.float32)
-                if moving:
-                    # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
-                    shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
-                    shape.set_density(self._options.density)
-                else:
-                    shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
-                    shape.local_pose = sapien.Pose(pose)
-                shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
-                shapes[-1].append(shape)
-        return shapes
-
-    def add_shapes(self, links: Sequence[PhysxArticulationLinkComponent]) -> PhysxRigidStaticComponent:
-        """Give the links their shapes; the result has those of what does not move.
-
-        Only a static body can have a surface as its shape.
-        """
-        static = PhysxRigidStaticComponent()
-        moves = self.tree.descendants.any(0).tolist()
-        for component, shapes, moving in zip(links, self.shapes, moves, strict=True):
-            for shape in shapes:
-                (component if moving else static).attach(shape)
-        return static
-
-    def poses(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """T_world_link [L, 4, 4] at a joint state [J]."""
-        return np.asarray(self.T_world_base @ self.tree.forward(torch.as_tensor(state, dtype=torch.float64)).numpy())
-
-    @cached_property
-    def _corners(self) -> NDArray[np.float64]:
-        """Corners [L, 8, 4] (homogeneous, in its frame) of each link's bounding box; nan for a link without a mesh."""
-        corners = np.full((len(self.object.links), 8, 4), np.nan)
-        for row, link in zip(corners, self.object.links, strict=True):
-            if link.visuals:
-                points = np.concatenate([mesh.vertices for mesh in link.visuals])
-                row[:, :3] = list(itertools.product(*np.stack([points.min(0), points.max(0)]).T))
-                row[:, 3] = 1.0
-        return corners
-
-    def bounds(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Bounds [2, 3] (m, world) of the links' bounding boxes at a joint state [J]."""
-        points = (self._corners @ self.poses(state).swapaxes(1, 2))[..., :3].reshape(-1, 3)
-        return np.stack([np.nanmin(points, 0), np.nanmax(points, 0)])
-
-
-class Stage:
-    """One of the parallel environments: the trial that runs there, and the object as it stands in its scene.
-
-    Attributes:
-        trial: the running trial.
-        model: its object.
-        target: position of the part's joint in a joint state [J].
-        goal: position (rad or m) of that joint when it is open.
-        sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
-        scene: the environment's own scene.
-        links: the object's links in the simulator, in the order of ``object.links``.
-        order: column of each of the J joints in the simulator's joint state.
-        static: what of the object collides as a surface.
-        bodies: the gripper's links that have a shape.
-        suction: holds the part.
-    """
-
-    scene: sapien.Scene
-    links: list[PhysxArticulationLinkComponent]
-    order: list[int]
-    static: PhysxRigidStaticComponent
-    bodies: list[PhysxArticulationLinkComponent]
-    suction: Suction
-
-    def __init__(self, trial: Trial, model: Model) -> None:
-        obj = model.object
-        if trial.link not in obj.movable or len(trial.start) != len(obj.movable):
-            raise UserError(
-                f"object {obj.id}: link {trial.link} with a start of {len(trial.start)} joints does not fit; "
-                f"its movable links are {obj.movable}"
-            )
-        self.trial, self.model, self.target = trial, model, obj.movable.index(trial.link)
-        self.goal = float(model.opened[self.target])
-        if abs(self.goal - trial.start[self.target]) < 1e-6:
-            raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
-        self.sign = 1.0 if self.goal > trial.start[self.target] else -1.0
-
-    @property
-    def object(self) -> ArticulatedObject:
-        """The object."""
-        return self.model.object
-
-    @property
-    def tree(self) -> KinematicTree:
-        """The object's kinematic tree."""
-        return self.model.tree
-
-    def place(self, trial: Trial) -> Stage:
-        """Another trial with the object that is built here already."""
-        stage = Stage(trial, self.model)
-        for name in ("scene", "links", "order", "static", "bodies", "suction"):
-            setattr(stage, name, getattr(self, name))
-        return stage
-
-    def poses(self) -> NDArray[np.float64]:
-        """World poses [L + 3, 4, 4] of the object's links, then of the gripper's hand and fingers."""
-        return np.stack([body.entity_pose.to_transformation_matrix() for body in (*self.links, *self.bodies)]).astype(
-            np.float64
-        )
-
-    @property
-    def moved(self) -> Tensor:
-        """[L] bool, the links that the target joint carries."""
-        return self.tree.descendants[self.target]
 
 
 class OpenArticulatedEnv(BaseEnv):
@@ -389,7 +221,7 @@ class OpenArticulatedEnv(BaseEnv):
         own = self.agent.robot.links_map
         built = []
         for e, stage in enumerate(self.stages):
-            articulation = _build(self, e, stage.object, stage.model.T_world_base, self.options)
+            articulation = stage.model.build(self.scene, e)
             self.remove_from_state_dict_registry(articulation)
             built.append(articulation)
             stage.scene = self.scene.sub_scenes[e]
@@ -642,44 +474,3 @@ def _joint_truth(stage: Stage, poses: NDArray[np.float64]) -> NDArray[np.float32
     """The axis (towards opening) and the origin of the joint to open, in the world, [6]."""
     joint, pose = stage.object.joint_of(stage.trial.link), poses[stage.trial.link]
     return np.concatenate([stage.sign * pose[:3, :3] @ joint.axis, pose[:3, 3]]).astype(np.float32)
-
-
-def _build(
-    env: OpenArticulatedEnv, e: int, obj: ArticulatedObject, base: NDArray[np.float64], o: EnvOptions
-) -> Articulation:
-    """Build the object from what was read of it: its files are from strangers and are not parsed a second time."""
-    builder = env.scene.create_articulation_builder()
-    builder.set_scene_idxs([e])
-    builder.initial_pose = sapien.Pose(base)
-    links: list[Any] = []
-    for link in obj.links:
-        links.append(builder.create_link_builder(links[link.parent] if link.joint is not None else None))
-        links[-1].set_name(link.name)
-        if link.joint is None:
-            links[-1].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
-            continue
-        links[-1].set_joint_name(link.joint.name)
-        axis = sapien.Pose(_axis_frame(link.joint))
-        # SAPIEN calls a hinge with limits "revolute_unwrapped" and one that turns on and on "revolute".
-        kinds = {"revolute": "revolute_unwrapped", "continuous": "revolute"}
-        links[-1].set_joint_properties(
-            kinds.get(link.joint.type, link.joint.type),
-            [list(link.joint.limits)] if link.joint.movable else [],
-            sapien.Pose(link.joint.origin) * axis,
-            axis,
-        )
-    articulation: Articulation = builder.build(name=f"object-{e}", fix_root_link=True)
-    for joint in articulation.active_joints:
-        joint.set_friction(o.joint_friction)
-        joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
-    return articulation
-
-
-def _axis_frame(joint: Joint) -> NDArray[np.float64]:
-    """T_joint_axis [4, 4] whose x axis is the joint's axis: PhysX's joints move along or about x."""
-    frame = np.eye(4)
-    if joint.movable:
-        y = np.cross(joint.axis, np.eye(3)[np.abs(joint.axis).argmin()])
-        y /= np.linalg.norm(y)
-        frame[:3, :3] = np.stack([joint.axis, y, np.cross(joint.axis, y)], axis=1)
-    return frame
