@@ -321,6 +321,17 @@ class OpenArticulatedEnv(BaseEnv):
         self._elapsed_steps[:] = elapsed[:, 0].to(self._elapsed_steps.dtype)
         self._contact, self._force = contact.bool(), force.clone()
 
+    # ---------------------------------------------------------------------------------------------- pictures
+
+    def body_poses(self) -> NDArray[np.float64]:
+        """World poses [L + 3, 4, 4] of the object's links, and of the gripper's hand, left and right finger."""
+        poses = [body.entity_pose.to_transformation_matrix() for body in (*self._links, *self._bodies)]
+        return np.stack(poses).astype(np.float64)
+
+    def gripper_meshes(self) -> list[list[Mesh]]:
+        """Meshes of the gripper's hand, left and right finger, each in its own frame."""
+        return [_box_meshes(body) for body in self._bodies]
+
 
 def _build(env: OpenArticulatedEnv, obj: ArticulatedObject, base: NDArray[np.float64], o: EnvOptions) -> Articulation:
     """Build the object from what was read of it: its files are from strangers and are not parsed a second time."""
