@@ -168,11 +168,13 @@ class EvaluationConfig:
             needs no simulator.
         expert: also run the expert on the same trials.
         clouds: clouds shown in the report.
+        videos: trials filmed with every policy, spread over the categories, half of them failures if there are any.
     """
 
     trials: int | None
     expert: bool
     clouds: int
+    videos: int
 
 
 @dataclass
@@ -242,6 +244,7 @@ def validate(cfg: CommandConfig) -> None:
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
     _at_least("evaluation.trials", 0 if cfg.evaluation.trials is None else cfg.evaluation.trials, 0)
+    _at_least("evaluation.videos", cfg.evaluation.videos, 0)
     for key in ("closed_share", "others_closed", "all_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:
             raise UserError(f"data.{key}={getattr(cfg.data, key)} is no share; give a number from 0 to 1")

@@ -20,6 +20,7 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.video import require_encoder
 from fb3d_rl.perception.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
@@ -102,16 +103,19 @@ def protocol(cfg: CommandConfig) -> Protocol:
     """What is evaluated.
 
     Raises:
-        UserError: there are trials to run, but no simulator.
+        UserError: there are trials to run, but no simulator, or videos to make, but no ffmpeg.
     """
     if cfg.evaluation.trials != 0:
         require_simulator()
+        if cfg.evaluation.videos:
+            require_encoder()
     return Protocol(
         samples=sample_options(cfg),
         env=env_options(cfg),
         trials=cfg.evaluation.trials,
         samples_per_object=cfg.data.eval_samples,
         clouds=cfg.evaluation.clouds,
+        videos=cfg.evaluation.videos,
         seed=cfg.seed,
     )
 

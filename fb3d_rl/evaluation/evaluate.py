@@ -25,6 +25,7 @@ from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_text, write_trials
 from fb3d_rl.evaluation.tables import show, summary
 from fb3d_rl.evaluation.trials import Scheduled, schedule
+from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 
@@ -39,6 +40,7 @@ class Protocol:
         trials: at most this many trials, None for all, 0 for none.
         samples_per_object: flow samples of each object and target.
         clouds: clouds kept for the report.
+        videos: trials filmed with every policy, 0 for none.
         seed: base seed of trials and samples.
     """
 
@@ -47,6 +49,7 @@ class Protocol:
     trials: int | None
     samples_per_object: int
     clouds: int
+    videos: int
     seed: int
 
 
@@ -60,8 +63,8 @@ def evaluate(
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
-    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, and
-    prints the table.
+    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, with
+    ``protocol.videos`` also videos/, and prints the table.
 
     Args:
         out: the run folder.
@@ -86,8 +89,7 @@ def evaluate(
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
     rows: list[TrialRow] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as bar:
+    with _progress() as bar:
         for name, policy in policies.items() if scheduled else ():
             task = bar.add_task(f"trials: {name}", total=len(scheduled))
             rows += run_trials(name, policy, shown, scheduled, protocol.env, partial(_advance, bar, task))
@@ -97,9 +99,22 @@ def evaluate(
     show(numbers, Console())
     if net is not None:
         write_picture(out)
+    if rows and protocol.videos:
+        with _progress() as bar:
+            task = bar.add_task("videos", total=None)
+            film_trials(
+                out / "videos", rows, protocol.videos, policies, shown, scheduled, protocol.env,
+                lambda done, total: bar.update(task, completed=done, total=total),
+            )  # fmt: skip
     report = write_report(out)
     print(f"results: {out}\nreport:  {report}")
+    if rows and protocol.videos:
+        print(f"videos:  {out / 'videos'}")
     return rows
+
+
+def _progress() -> Progress:
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 
 def _advance(bar: Progress, task: TaskID, row: TrialRow) -> None:
