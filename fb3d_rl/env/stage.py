@@ -51,6 +51,7 @@ class Model:
         opened: joint state [J] in which everything is open.
         T_world_base: pose [4, 4] that stands it on the ground.
         links: what of it can be opened.
+        gripper: meshes of the gripper's hand, left and right finger, each in its own frame.
     """
 
     def __init__(self, obj: ArticulatedObject, options: EnvOptions) -> None:
@@ -59,12 +60,13 @@ class Model:
         self.closed, self.opened = opening_range(obj)
         self.T_world_base = standing_pose(obj)
         self.links = openable_links(obj)
+        self.gripper = gripper_meshes()
         self._options = options
 
     @cached_property
     def camera(self) -> RaycastCamera:
         """Sees the object's links and then the gripper's bodies."""
-        return RaycastCamera(self.object, gripper_meshes(), self._options.camera)
+        return RaycastCamera(self.object, self.gripper, self._options.camera)
 
     @cached_property
     def shapes(self) -> list[list[Any]]:

@@ -464,17 +464,6 @@ class OpenArticulatedEnv(BaseEnv):
 
         self.set_state_dict(take(self.get_state_dict()), env_idx)
 
-    # ---------------------------------------------------------------------------------------------- pictures
-
-    def body_poses(self) -> NDArray[np.float64]:
-        """World poses [L + 3, 4, 4] of the object's links, and of the gripper's hand, left and right finger."""
-        poses = [body.entity_pose.to_transformation_matrix() for body in (*self._links, *self._bodies)]
-        return np.stack(poses).astype(np.float64)
-
-    def gripper_meshes(self) -> list[list[Mesh]]:
-        """Meshes of the gripper's hand, left and right finger, each in its own frame."""
-        return [_box_meshes(body) for body in self._bodies]
-
 
 # ManiSkill's own decorator would wrap the task in a time limit that overrides ``truncated``.
 register(TASK, OpenArticulatedEnv)

@@ -83,14 +83,14 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
             while True:
                 # After the last step the policy is asked once more, for what it predicts there.
                 frame = policy(frame)
-                poses.append(base.env.body_poses())
+                poses.append(base.env.stages[0].poses())
                 frames.append(frame[0].clone())
                 if done:
                     break
                 frame = env.step(frame)
                 done = bool(frame["next", "done"])
                 frame = step_mdp(frame)
-        gripper = base.env.gripper_meshes()
+        gripper = base.env.stages[0].model.gripper
     finally:
         env.close(raise_if_closed=False)
     predicted = ("prediction", "flow") in frames[0].keys(include_nested=True)
