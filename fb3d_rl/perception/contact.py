@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fb3d_rl.geometry.points import gather, knn, pca_curvature
+from fb3d_rl.flow.rigid_motion import rigid_motion, screw
+from fb3d_rl.geometry.points import gather, knn, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
 
 
@@ -26,6 +27,11 @@ class ContactOptions:
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
         clearance: where that cylinder starts, in front of the point, m.
         reach: where that cylinder ends, m.
+        hand_length: from the tip to the hand's far end, m.
+        weak_flow: share of the largest flow that does if no point with more can be moved freely.
+        candidates: points whose way along the flow is checked.
+        sweep: how far along its way a point has to be free, m; ``sweep_angle`` (rad) if that is less.
+        sweep_steps: places along the way that are checked.
     """
 
     neighbors: int = 12
@@ -37,22 +43,30 @@ class ContactOptions:
     hand_radius: float = 0.05
     clearance: float = 0.06
     reach: float = 0.6
+    hand_length: float = 0.15
+    weak_flow: float = 0.1
+    candidates: int = 64
+    sweep: float = 1.0
+    sweep_angle: float = 1.6
+    sweep_steps: int = 8
 
 
 def choose_contact(
-    points: Tensor, valid: Tensor, flow: Tensor, camera: Tensor, avoid: Tensor, options: ContactOptions
+    points: Tensor, valid: Tensor, part: Tensor, flow: Tensor, camera: Tensor, avoid: Tensor, options: ContactOptions
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Choose where to touch each cloud and from which side.
 
     The point of largest flow is taken if it is a good place for a suction cup: the surface is flat around it (PCA
-    curvature), it is no rim of the part, no point of the cloud stands in the hand's way and it was not tried before.
+    curvature), it is no rim of the part, the hand can come and go along with it, and it was not tried before.
     Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is good, the demands are dropped
     one after the other. The hand comes against the flow (I.F). Where the flow runs along the surface, as on a
-    sliding sash, or into it, it comes against the surface's normal instead.
+    sliding sash, or into it, it comes against the surface's normal instead; where something stands in the way, along
+    the normal or the line of sight, which is free as far as the camera sees.
 
     Args:
-        points: [B, N, 3] world points, m.
+        points: [B, N, 3] world points, m; the ground is z = 0.
         valid: [B, N] bool.
+        part: [B, N] bool, points of the part to open.
         flow: [B, N, 3] flow of the part to open, 0 elsewhere.
         camera: [B, 3] position of the camera, which tells a surface's outside.
         avoid: [B, N] bool, points not to be touched (tried in vain before).
@@ -64,19 +78,36 @@ def choose_contact(
     """
     norm = flow.norm(dim=-1)
     largest = norm.amax(-1, keepdim=True)
-    movable = valid & (norm >= options.min_flow * largest) & (largest > 0)
+    weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
+    movable = weak & (norm >= options.min_flow * largest)
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
     curvature, normals = pca_curvature(points, options.neighbors, on_part, camera)
     direction = normalize(flow)
     along = (direction * normals).sum(-1, keepdim=True)
-    standoff = torch.where(along >= options.facing, direction, normals)
+    sight = normalize(camera[:, None] - points)
+    usual = torch.where(along >= options.facing, direction, normals)
+    usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+
+    squared = squared_distances(points, points)
+    ways = torch.stack([usual, normals, sight], dim=2)
+    free = torch.stack([~_blocked(points, squared, valid, way, options) for way in ways.unbind(2)], dim=-1)
+    first = free.int().argmax(-1)  # the first free way; the usual one where none is
+    standoff = ways.gather(2, first[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
 
     smooth = (curvature <= options.curvature) & ~_rim(points, on_part, options)
-    free = ~_blocked(points, valid, standoff, options)
     fresh = ~avoid
+    peak = torch.where(movable & fresh, norm, torch.full_like(norm, -1.0)).argmax(-1)
+    rows = torch.arange(len(points), device=points.device)
+    distance = (points - points[rows, peak][:, None]).norm(dim=-1)
+    reachable = weak & smooth & fresh & free.any(-1)
+    clear = _clear(points, valid & ~part, part & valid, flow, standoff, reachable, distance, options)
+
     tiers = [
-        movable & smooth & free & fresh,
-        movable & free & fresh,
+        movable & smooth & free[..., 0] & fresh & clear,
+        movable & smooth & free.any(-1) & fresh & clear,
+        reachable & clear,
+        movable & smooth & free.any(-1) & fresh,
+        movable & free.any(-1) & fresh,
         movable & smooth & fresh,
         movable & fresh,
         movable,
@@ -84,9 +115,6 @@ def choose_contact(
     score = torch.stack([tier.any(-1) for tier in tiers], dim=-1).int().argmax(-1)  # the first tier with a point
     good = torch.stack(tiers, dim=1).gather(1, score[:, None, None].expand(-1, 1, valid.shape[1])).squeeze(1)
 
-    peak = torch.where(movable & fresh, norm, torch.full_like(norm, -1.0)).argmax(-1)
-    rows = torch.arange(len(points), device=points.device)
-    distance = (points - points[rows, peak][:, None]).norm(dim=-1)
     far_enough = good & (distance >= options.min_distance)
     near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
     index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
@@ -105,10 +133,52 @@ def _rim(points: Tensor, on_part: Tensor, options: ContactOptions) -> Tensor:
     return (mean - points).norm(dim=-1) > options.rim * spread
 
 
-def _blocked(points: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
-    """Whether other points stand in the cylinder that the hand needs in front of each point, [B, N] bool."""
-    offset = points[:, None] - points[:, :, None]  # [B, N, N, 3]: from point i to point j
-    ahead = (offset * standoff[:, :, None]).sum(-1)
-    aside = (offset.square().sum(-1) - ahead.square()).clamp_min(0).sqrt()
-    inside = (ahead > options.clearance) & (ahead < options.reach) & (aside < options.hand_radius) & valid[:, None]
-    return inside.sum(-1) > 1
+def _blocked(points: Tensor, squared: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
+    """Whether other points, or the ground, are in the cylinder that the hand needs before each point, [B, N] bool."""
+    ahead = standoff @ points.mT - (standoff * points).sum(-1, keepdim=True)  # [B, N, N]: of point j before point i
+    aside = squared - ahead.square()
+    inside = (ahead > options.clearance) & (ahead < options.reach) & (aside < options.hand_radius**2) & valid[:, None]
+    return (inside.sum(-1) > 1) | _underground(points, standoff, options)
+
+
+def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
+    """Whether the hand's far end would be below the ground z = 0, [B, N] bool."""
+    return points[..., 2] + options.hand_length * standoff[..., 2] < 0
+
+
+def _clear(
+    points: Tensor,
+    obstacle: Tensor,
+    part: Tensor,
+    flow: Tensor,
+    standoff: Tensor,
+    wanted: Tensor,
+    distance: Tensor,
+    options: ContactOptions,
+) -> Tensor:
+    """Which points the hand can hold all along their way with the part, [B, N] bool.
+
+    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet a point of
+    ``obstacle`` or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the smallest to
+    the largest ``distance``; the others count as not clear.
+    """
+    count = min(options.candidates, points.shape[1])
+    order = torch.where(wanted, distance, torch.inf).argsort(-1)
+    among = torch.linspace(0, 1, count, device=points.device) * (wanted.sum(-1, keepdim=True) - 1).clamp_min(0)
+    index = order.gather(1, among.round().long())  # [B, K]
+    contact, away = gather(points, index), gather(standoff, index)
+    centre = (points * part[..., None]).sum(1) / part.sum(-1, keepdim=True).clamp_min(1)
+    velocity, omega = rigid_motion(points, flow, part.to(points.dtype), centre, 1e-4)
+    speed = (velocity[:, None] + torch.linalg.cross(omega[:, None], contact - centre[:, None])).norm(dim=-1)
+    time = options.sweep / speed.clamp_min(1e-6)
+    time = torch.minimum(time, options.sweep_angle / omega.norm(dim=-1, keepdim=True).clamp_min(1e-6))
+    reach = torch.linspace(options.clearance, options.hand_length, 3, device=points.device)
+    clear = torch.ones_like(index, dtype=torch.bool)
+    for step in range(1, options.sweep_steps + 1):
+        turn, shift = screw(velocity[:, None], omega[:, None], time * step / options.sweep_steps)
+        at = (turn @ (contact - centre[:, None])[..., None]).squeeze(-1) + shift + centre[:, None]
+        hand = at[:, :, None] + reach[:, None] * (turn @ away[..., None]).squeeze(-1)[:, :, None]  # [B, K, 3, 3]
+        gap = torch.cdist(hand.flatten(1, 2), points).masked_fill(~obstacle[:, None], torch.inf).amin(-1)
+        clear &= (gap.view_as(hand[..., 0]) > options.hand_radius).all(-1) & (hand[..., 2] > 0).all(-1)
+    result = torch.zeros_like(wanted).scatter(1, index, clear)
+    return result & wanted

@@ -14,6 +14,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor
 
 from fb3d_rl.contract import ACTION_DIM
+from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.transforms import (
     alignment,
     euler_xyz_jacobian,
@@ -183,7 +184,13 @@ class FlowPolicy(TensorDictModuleBase):
         caught = attached & (state["contact_flow"].norm(dim=-1) == 0)  # held before a point was chosen
         if bool((choosing | caught).any()):
             chosen = choose_contact(
-                obs["points"], obs["valid"], flow, obs["camera_position"], self._avoid(state, obs), o.contact
+                obs["points"],
+                obs["valid"],
+                obs["part_mask"],
+                flow,
+                obs["camera_position"],
+                self._avoid(state, obs),
+                o.contact,
             )
             for key, value in zip(("contact_point", "contact_flow", "standoff"), chosen, strict=True):
                 state[key] = torch.where((choosing | caught)[:, None], value, state[key])
@@ -247,20 +254,9 @@ class FlowPolicy(TensorDictModuleBase):
         near ones foremost: the hand often hides those around the held point.
         """
         o = self.options
-        arm = obs["points"] - tip[:, None]
-        weight = (obs["part_mask"] & obs["valid"]) / (1.0 + arm.square().sum(-1) / o.nearby**2)
-        weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
-        weighted = weight * arm
-        mean_arm, mean_flow = weighted.sum(1), (weight * flow).sum(1)
-        # The normal equations of omega, v eliminated: the inertia of the points about their mean, and their moment.
-        eye = torch.eye(3, dtype=flow.dtype, device=flow.device)
-        spread = weighted.mT @ arm - mean_arm[..., :, None] * mean_arm[..., None, :]
-        trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-        # A little of the identity keeps omega from running away where few points lie in a row.
-        inertia = (trace + 1e-2 * o.nearby**2) * eye - spread
-        moment = torch.linalg.cross(weighted, flow).sum(1) - torch.linalg.cross(mean_arm, mean_flow)
-        omega = torch.linalg.solve(inertia, moment)
-        at_tip = mean_flow - torch.linalg.cross(omega, mean_arm)
+        squared = (obs["points"] - tip[:, None]).square().sum(-1)
+        weight = (obs["part_mask"] & obs["valid"]) / (1.0 + squared / o.nearby**2)
+        at_tip, omega = rigid_motion(obs["points"], flow, weight, tip, 1e-2 * o.nearby**2)
         speed = at_tip.norm(dim=-1, keepdim=True)
         rate = o.lead * o.pull_speed * omega / speed.clamp_min(1e-6)
         ahead = normalize(at_tip) + torch.linalg.cross(rate, normalize(at_tip))

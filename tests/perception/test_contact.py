@@ -17,7 +17,15 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
     nobody = torch.zeros_like(valid)
     camera = torch.tensor([[-3.0, 0.0, 1.0]])
-    return choose_contact(points, valid, flow, camera, nobody if avoid is None else avoid, ContactOptions(**options))
+    return choose_contact(
+        points,
+        valid,
+        flow.norm(dim=-1) > 0,
+        flow,
+        camera,
+        nobody if avoid is None else avoid,
+        ContactOptions(**options),
+    )
 
 
 def hinge_flow(points: torch.Tensor) -> torch.Tensor:
@@ -78,6 +86,46 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
     flow = hinge_flow(points)
     flow[:, :300] *= 100.0
     contact, _, _ = choose_contact(
-        points, valid, flow, torch.tensor([[-3.0, 0.0, 1.0]]), torch.zeros_like(valid), ContactOptions(min_flow=0.0)
+        points,
+        valid,
+        valid,
+        flow,
+        torch.tensor([[-3.0, 0.0, 1.0]]),
+        torch.zeros_like(valid),
+        ContactOptions(min_flow=0.0),
     )
     assert not (points[0, :300] == contact[0]).all(-1).any()
+
+
+def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_line_of_sight() -> None:
+    points = plate()
+    board = points - torch.tensor([0.3, 0.0, 0.0])  # before the whole plate; the camera looks over it
+    cloud = torch.cat([points, board], dim=1)
+    flow = torch.cat([hinge_flow(points), torch.zeros(1, cloud.shape[1] - points.shape[1], 3)], dim=1)
+    camera = torch.tensor([[-3.0, 0.0, 4.0]])
+    valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
+    contact, direction, standoff = choose_contact(
+        cloud, valid, flow.norm(dim=-1) > 0, flow, camera, torch.zeros_like(valid), ContactOptions()
+    )
+    assert torch.allclose(direction[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
+    assert torch.allclose(standoff, torch.nn.functional.normalize(camera - contact), atol=1e-4)
+
+
+def test_the_hand_does_not_come_from_below_the_ground() -> None:
+    points = plate()[..., [1, 2, 0]] + torch.tensor([0.0, 0.0, 0.1])  # a lying plate that moves down
+    flow = torch.tensor([0.0, 0.0, -1.0]).expand_as(points).clone()
+    camera = torch.tensor([[-3.0, 0.0, 0.05]])  # seen from below
+    valid = torch.ones(points.shape[:2], dtype=torch.bool)
+    _, _, standoff = choose_contact(points, valid, valid, flow, camera, torch.zeros_like(valid), ContactOptions())
+    assert standoff[0, 2] > -0.1
+
+
+def test_leaves_a_point_whose_way_is_blocked_for_one_that_can_be_moved() -> None:
+    points = plate()
+    post = torch.zeros(1, 40, 3)  # where the outer edge of the plate comes along after a turn of about 0.9 rad
+    post[..., 0], post[..., 1], post[..., 2] = -0.75, -0.1, torch.linspace(0.4, 1.6, 40)
+    cloud = torch.cat([points, post], dim=1)
+    flow = torch.cat([hinge_flow(points), torch.zeros(1, 40, 3)], dim=1)
+    free, _, _ = choose(points, hinge_flow(points))
+    contact, _, _ = choose(cloud, flow)
+    assert contact[0, 1] > free[0, 1] + 0.1, "nearer to the hinge than without the post"

@@ -1,0 +1,60 @@
+"""The rigid motion behind a flow: fit it to a part's points, follow it further than the flow's small step."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fb3d_rl.geometry.transforms import axis_angle_to_matrix, normalize, skew
+
+
+def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
+    """Velocity v at ``at`` and angular velocity omega of the rigid motion that fits a flow best.
+
+    Minimises sum_i w_i |v + omega x (p_i - at) - f_i|^2 with the weights scaled to sum 1: v is eliminated, what is
+    left are the equations of angular momentum about the weighted mean of the points.
+
+    Args:
+        points: [B, N, 3] m.
+        flow: [B, N, 3] displacement or velocity of each point.
+        weight: [B, N] non-negative weights; a cloud whose weights are all 0 has no motion.
+        at: [B, 3] m.
+        ridge: added to the moments of inertia (m^2), so that omega does not run away where points lie in a row.
+
+    Returns:
+        v [B, 3] in the unit of the flow and omega [B, 3] in that unit per m.
+    """
+    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
+    arm = points - at[:, None]
+    weighted = weight * arm
+    mean_arm, mean_flow = weighted.sum(1), (weight * flow).sum(1)
+    spread = weighted.mT @ arm - mean_arm[..., :, None] * mean_arm[..., None, :]
+    trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    eye = torch.eye(3, dtype=points.dtype, device=points.device)
+    momentum = torch.linalg.cross(weighted, flow).sum(1) - torch.linalg.cross(mean_arm, mean_flow)
+    omega = torch.linalg.solve((trace + ridge) * eye - spread, momentum)
+    return mean_flow - torch.linalg.cross(omega, mean_arm), omega
+
+
+def screw(velocity: Tensor, omega: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    """Where a constant rigid motion takes a body (the exponential map of SE(3)).
+
+    A point x becomes ``turn @ x + shift``; the origin is the point that ``velocity`` is of.
+
+    Args:
+        velocity: [..., 3] of the body's point at the origin.
+        omega: [..., 3] angular velocity, rad per unit of time.
+        time: [...].
+
+    Returns:
+        turn [..., 3, 3] and shift [..., 3].
+    """
+    turned = omega * time[..., None]
+    angle = turned.norm(dim=-1)
+    turn = axis_angle_to_matrix(normalize(turned), angle)
+    cross, size = skew(turned), angle.clamp_min(1e-4)[..., None, None]
+    first = 0.5 * torch.sinc(0.5 * size / torch.pi).square()  # (1 - cos) / angle^2
+    second = torch.where(size > 1e-2, (size - size.sin()) / size**3, 1 / 6)
+    eye = torch.eye(3, dtype=omega.dtype, device=omega.device)
+    mean_turn = eye + first * cross + second * (cross @ cross)
+    return turn, (mean_turn @ (velocity * time[..., None])[..., None]).squeeze(-1)
