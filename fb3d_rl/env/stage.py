@@ -18,7 +18,6 @@ from sapien.physx import (
     PhysxRigidStaticComponent,
     get_default_material,
 )
-from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint
 from fb3d_rl.camera.raycast import RaycastCamera
@@ -168,6 +167,7 @@ class Stage:
         target: position of the part's joint in a joint state [J].
         goal: position (rad or m) of that joint when it is open.
         sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
+        moved: [L] bool, the links that the joint carries.
         scene: the environment's own scene.
         links: the object's links in the simulator, in the order of ``object.links``.
         order: column of each of the J joints in the simulator's joint state.
@@ -195,6 +195,7 @@ class Stage:
         if abs(self.goal - trial.start[self.target]) < 1e-6:
             raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
         self.sign = 1.0 if self.goal > trial.start[self.target] else -1.0
+        self.moved = model.tree.descendants[self.target]
 
     @property
     def object(self) -> ArticulatedObject:
@@ -215,14 +216,8 @@ class Stage:
 
     def poses(self) -> NDArray[np.float64]:
         """World poses [L + 3, 4, 4] of the object's links, then of the gripper's hand and fingers."""
-        return np.stack([body.entity_pose.to_transformation_matrix() for body in (*self.links, *self.bodies)]).astype(
-            np.float64
-        )
-
-    @property
-    def moved(self) -> Tensor:
-        """[L] bool, the links that the target joint carries."""
-        return self.tree.descendants[self.target]
+        bodies = (*self.links, *self.bodies)
+        return np.array([body.entity_pose.to_transformation_matrix() for body in bodies], dtype=np.float64)
 
 
 def _axis_frame(joint: Joint) -> NDArray[np.float64]:
