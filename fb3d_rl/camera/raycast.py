@@ -123,7 +123,12 @@ class RaycastCamera:
 
         Returns:
             World points [P, 3] (m) where rays hit, row by row of the image, and the index of the body hit [P].
+
+        Raises:
+            ValueError: there is not one pose for each link and further body.
         """
+        if len(poses) != len(self._corners):
+            raise ValueError(f"{len(poses)} poses were given for {len(self._corners)} links and further bodies")
         image = self._nearest(np.array(poses, dtype=np.float64, order="C"), view).ravel()
         seen = np.flatnonzero((image < _NOTHING) if further else (image < _NOTHING) & ((image & _LOW) < self._links))
         keys = image.take(seen)
@@ -133,7 +138,8 @@ class RaycastCamera:
     def _nearest(self, poses: NDArray[np.float64], view: View) -> NDArray[np.uint64]:
         """Keys [n, n] of what each pixel shows. The hits of links that rest are kept merged, as the background."""
         links = np.arange(len(poses)) < self._links
-        if view != self._view:
+        last, self._view = self._view, None  # nothing is kept of a frame that fails
+        if view != last:
             self._camera = self.pose(view)
             self._rays = pixel_rays(self._camera, self._ticks)
             rests, background = np.zeros(len(poses), dtype=bool), links
