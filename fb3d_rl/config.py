@@ -61,6 +61,8 @@ class DataConfig:
 class CameraConfig:
     """fb3d_rl.camera.raycast.CameraOptions and fb3d_rl.camera.views.ViewRange."""
 
+    kind: str
+    shader: str
     resolution: int
     fov: float
     margin: float
@@ -215,6 +217,8 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
     _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     _one_of("env.suction.hold", cfg.env.suction.hold, ("target", "any"))
+    _one_of("camera.kind", cfg.camera.kind, ("raycast", "sapien"))
+    _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
         _one_of("algo.name", cfg.algo.name, ("artflownet",))

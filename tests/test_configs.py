@@ -181,6 +181,8 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("camera.azimuth=[10,-10]", "camera.azimuth"),
         ("camera.elevation=[10]", "camera.elevation"),
         ("camera.resolution=0", "camera.resolution"),
+        ("camera.kind=lidar", "camera.kind"),
+        ("camera.shader=rt", "camera.shader"),
         ("evaluation.trials=-1", "evaluation.trials"),
         ("env.suction.hold=all", "env.suction.hold"),
         ("policy=expert", "policy.name"),
@@ -191,6 +193,14 @@ def test_defaults_are_the_librarys(name: str) -> None:
 def test_values_out_of_range_are_named(override: str, word: str) -> None:
     with pytest.raises(UserError, match=re.escape(word)):
         validate(compose("train", override))
+
+
+def test_the_camera_of_the_task_can_be_another_than_that_of_the_samples() -> None:
+    from fb3d_rl.algos import setup
+
+    cfg = compose("train", "camera=sapien", "camera.shader=default", "camera.fov=50")
+    assert setup.env_options(cfg).camera == CameraOptions(fov=50, kind="sapien", shader="default")
+    assert setup.sample_options(cfg).camera == CameraOptions(fov=50)  # samples drawn before stay valid
 
 
 def test_a_missing_checkpoint_is_named() -> None:

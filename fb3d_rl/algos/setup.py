@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import torch
 
@@ -72,6 +72,7 @@ def sample_options(cfg: CommandConfig) -> SampleOptions:
 def env_options(cfg: CommandConfig) -> EnvOptions:
     """The task's constants."""
     env = cfg.env
+    kind = cast(Literal["raycast", "sapien"], cfg.camera.kind)
     return EnvOptions(
         gripper=GripperOptions(**asdict(env.gripper)),
         suction=SuctionOptions(**asdict(env.suction)),
@@ -84,7 +85,7 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
         joint_friction=env.joint_friction,
         joint_damping=env.joint_damping,
         density=env.density,
-        camera=camera_options(cfg),
+        camera=replace(camera_options(cfg), kind=kind, shader=cfg.camera.shader),
     )
 
 

@@ -9,14 +9,16 @@ alone, whatever was taken before.
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
-from fb3d_rl.camera.views import View, look_at
+from fb3d_rl.camera.views import View, look_at, pixel_points, pixel_rays
 from fb3d_rl.contract import UserError
 from fb3d_rl.flow.opening import standing_bounds
 
@@ -35,11 +37,27 @@ class CameraOptions:
         resolution: pixels along each side of the square image.
         fov: full field of view, degrees.
         margin: the closed object's bounding sphere fills 1 / margin of the field of view.
+        kind: what the simulated task sees with: "raycast" (this module) or "sapien", SAPIEN's renderer, which needs
+            Vulkan (:mod:`fb3d_rl.camera.sapien`). They see the same; flow samples for training always are "raycast".
+        shader: SAPIEN's shader pack, "minimal" (depth in whole millimetres, up to 32 m) or "default" (exact, slower).
+            Its ray tracers jitter their rays and blur depth over several pixels.
     """
 
     resolution: int = 96
     fov: float = 40.0
     margin: float = 1.15
+    kind: Literal["raycast", "sapien"] = "raycast"
+    shader: str = "minimal"
+
+    @property
+    def slope(self) -> float:
+        """Largest x / z and y / z in the image: at its edge."""
+        return math.tan(math.radians(0.5 * self.fov))
+
+    @property
+    def ticks(self) -> NDArray[np.float64]:
+        """Centres [resolution] of the pixels: x / z of the columns and y / z of the rows."""
+        return ((np.arange(self.resolution) + 0.5) / self.resolution * 2.0 - 1.0) * self.slope
 
 
 _LOW = np.uint64(0xFFFFFFFF)
@@ -79,18 +97,15 @@ class RaycastCamera:
         """Point that the camera looks at: the centre of the closed, standing object's bounding box, m."""
         self.radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
         """Radius (m) of the sphere around that box."""
-        half = np.radians(0.5 * self.options.fov)
-        self.distance = self.options.margin * self.radius / np.sin(half)
-        n = self.options.resolution
-        self._slope = float(np.tan(half))
-        self._ticks = ((np.arange(n) + 0.5) / n * 2.0 - 1.0) * self._slope
+        self.distance = self.options.margin * self.radius / math.sin(math.radians(0.5 * self.options.fov))
+        self._ticks = self.options.ticks
         # The last frame: view, poses, each body's hits (the rows and columns that it may cover and the keys there), and
         # which links are merged in the background.
         self._view: View | None = None
         self._poses = np.zeros((0, 4, 4))
         self._hits: dict[int, tuple[tuple[slice, slice], NDArray[np.uint64]]] = {}
         self._in_background = np.zeros(0, dtype=bool)
-        self._background = np.empty((n, n), dtype=np.uint64)
+        self._background = np.empty([self.options.resolution] * 2, dtype=np.uint64)
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """T_world_camera [4, 4] of a view; x right, y down, z forward."""
@@ -108,21 +123,25 @@ class RaycastCamera:
 
         Returns:
             World points [P, 3] (m) where rays hit, row by row of the image, and the index of the body hit [P].
+
+        Raises:
+            ValueError: there is not one pose for each link and further body.
         """
+        if len(poses) != len(self._corners):
+            raise ValueError(f"{len(poses)} poses were given for {len(self._corners)} links and further bodies")
         image = self._nearest(np.array(poses, dtype=np.float64, order="C"), view).ravel()
         seen = np.flatnonzero((image < _NOTHING) if further else (image < _NOTHING) & ((image & _LOW) < self._links))
         keys = image.take(seen)
         depth = (keys >> _HALF).astype(np.uint32).view(np.float32)
-        points = np.empty((len(seen), 3))
-        for axis in range(3):
-            points[:, axis] = self._camera[axis, 3] + depth * self._rays[axis].take(seen)
-        return points, (keys & _LOW).astype(np.int64)
+        return pixel_points(self._camera, self._rays, seen, depth), (keys & _LOW).astype(np.int64)
 
     def _nearest(self, poses: NDArray[np.float64], view: View) -> NDArray[np.uint64]:
         """Keys [n, n] of what each pixel shows. The hits of links that rest are kept merged, as the background."""
         links = np.arange(len(poses)) < self._links
-        if view != self._view:
-            self._look(view)
+        last, self._view = self._view, None  # nothing is kept of a frame that fails
+        if view != last:
+            self._camera = self.pose(view)
+            self._rays = pixel_rays(self._camera, self._ticks)
             rests, background = np.zeros(len(poses), dtype=bool), links
         else:
             rests = (poses.view(np.uint64) == self._poses.view(np.uint64)).all((1, 2))
@@ -136,12 +155,6 @@ class RaycastCamera:
         self._merge(~background, image)
         return image
 
-    def _look(self, view: View) -> None:
-        """Turn the camera and the world directions [3, n * n] of its pixels, whose depth is 1."""
-        self._camera = self.pose(view)
-        right, down, forward = self._camera[:3, :3].T[:, :, None, None]
-        self._rays = (forward + self._ticks[:, None] * down + self._ticks * right).reshape(3, -1)
-
     def _cast(self, indices: list[int], poses: NDArray[np.float64]) -> None:
         """Take new hits of some bodies."""
         if not indices:
@@ -150,7 +163,7 @@ class RaycastCamera:
         rotations = to_camera @ poses[indices, :3, :3]  # of T_camera_body
         origins = to_camera @ (poses[indices, :3, 3:] - self._camera[:3, 3:])
         corners = rotations @ self._corners[indices] + origins
-        pixels = corners[:, :2] / np.maximum(corners[:, 2:], 1e-6) * (0.5 * n / self._slope) + (0.5 * n - 0.5)
+        pixels = corners[:, :2] / np.maximum(corners[:, 2:], 1e-6) * (0.5 * n / self.options.slope) + (0.5 * n - 0.5)
         low, high = pixels.min(-1), pixels.max(-1)
         beside = corners[:, 2].min(-1) <= 1e-6  # or behind the lens: the body may cover any pixel
         low[beside], high[beside] = 0.0, n

@@ -1,4 +1,4 @@
-"""Viewpoints around an object: azimuth and elevation (supplement, II.C)."""
+"""Viewpoints around an object: azimuth and elevation (supplement, II.C); and what the pixels of a picture look at."""
 
 from __future__ import annotations
 
@@ -42,3 +42,24 @@ def look_at(view: View, centre: NDArray[np.float64], distance: float) -> NDArray
     pose[:3, :3] = np.stack([right, down, forward], axis=1)
     pose[:3, 3] = centre + distance * outward
     return pose
+
+
+def pixel_rays(camera: NDArray[np.float64], ticks: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World directions [3, n * n] of a picture's pixels, row by row, each with a depth of 1.
+
+    Args:
+        camera: T_world_camera [4, 4]; camera x right, y down, z forward.
+        ticks: x / z of the columns' and y / z of the rows' pixel centres [n].
+    """
+    right, down, forward = camera[:3, :3].T[:, :, None, None]
+    return (forward + ticks[:, None] * down + ticks * right).reshape(3, -1)
+
+
+def pixel_points(
+    camera: NDArray[np.float64], rays: NDArray[np.float64], pixels: NDArray[np.int64], depth: NDArray[np.floating]
+) -> NDArray[np.float64]:
+    """World points [P, 3] (m) at ``depth`` [P] (m) on the ``rays`` [3, n * n] of some ``pixels`` [P]."""
+    points = np.empty((len(pixels), 3))
+    for axis in range(3):
+        points[:, axis] = camera[axis, 3] + depth * rays[axis].take(pixels)
+    return points

@@ -249,6 +249,17 @@ def test_a_picture_follows_from_poses_and_view_alone(procedural_objects: dict[st
     assert len(pictures) > 30
 
 
+def test_a_frame_that_fails_leaves_no_trace() -> None:
+    camera = RaycastCamera(drawer(), options=OPTIONS)
+    before = camera.capture(still(2), FRONT)
+    with pytest.raises(ValueError, match="1 poses .* 2 links"):
+        camera.capture(still(1), View(40.0, 35.0))
+    with pytest.raises((ValueError, IndexError)):
+        camera.capture(np.zeros((2, 3, 3)), View(40.0, 35.0))
+    for a, b in zip(before, camera.capture(still(2), FRONT), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_of_two_bodies_in_one_place_the_first_is_seen_whichever_moved_last() -> None:
     cube = [box((1, 1, 1), (0, 0, 0.5))]
     camera = RaycastCamera(rigid_object(cube, cube, cube), bodies=[cube], options=OPTIONS)
