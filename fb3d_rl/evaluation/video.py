@@ -116,7 +116,8 @@ class Stage:
             outlines.append(starts + self._length * flows)
         for body, leader in [*self.moving, (self._cups[False], self._hand)]:
             poses = self.film.poses[around if leader >= self._hand else slice(None), leader]
-            outlines.append((body.outline() @ poses[:, :3, :3].mT + poses[:, None, :3, 3]).reshape(-1, 3))
+            turned = np.einsum("tij,pj->tpi", poses[:, :3, :3], body.outline())
+            outlines.append((turned + poses[:, None, :3, 3]).reshape(-1, 3))
         return np.concatenate(outlines)
 
     def _best_view(self) -> View:
