@@ -62,8 +62,8 @@ GHOST = 0.3
 FAR = 1e6
 """Distance (m) of the empty background."""
 
-GROUND, NOTHING, SIGN = -1, -2, 1000
-"""Numbers of the ground and of the empty background among those of bodies, and the first number of signs."""
+GROUND, NOTHING, OPAQUE, SIGN = -1, -2, 1000, 2000
+"""Numbers of the ground and of the empty background among those of bodies, and the first of opaque ones and signs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,14 @@ class Body:
 
     Args:
         parts: the parts.
-        sign: this is a sign such as an arrow: it neither takes light from others nor do they from it.
+        sign: this is a sign such as an arrow: it neither takes light from others nor do they from it, and it shimmers
+            through what hides it.
+        opaque: no sign shimmers through this.
     """
 
-    def __init__(self, parts: Iterable[Part], sign: bool = False) -> None:
+    def __init__(self, parts: Iterable[Part], sign: bool = False, opaque: bool = False) -> None:
         self.sign = sign
+        self.rank = SIGN if sign else OPAQUE if opaque else 0
         corners, normals, colors = [np.zeros((0, 3, 3))], [np.zeros((0, 3, 3))], [np.zeros((0, 3))]
         for part in parts:
             rotation, shift = part.pose[:3, :3], part.pose[:3, 3]
@@ -278,7 +281,8 @@ class _Surface:
         self.distance[taken], self.normal[taken] = other.distance[nearer], other.normal[nearer]
         self.color[taken], self.body[taken] = other.color[nearer], body
         if body >= SIGN:
-            self.behind[where[~nearer]] = other.color[~nearer]
+            veiled = ~nearer & (self.body[where] < OPAQUE)
+            self.behind[where[veiled]] = other.color[veiled]
         return taken
 
     def copy(self) -> _Surface:
@@ -373,7 +377,7 @@ class Studio:
         return passed
 
     def picture(self, moving: Sequence[Placed] = ()) -> NDArray[np.uint8]:
-        """The image [H, W, 3] with the ``moving`` bodies at their T_world_body [4, 4]."""
+        """The image [H, W, 3] with the ``moving`` bodies, signs last, at their T_world_body [4, 4]."""
         width, height = self.camera.size
         seen, points, light = self._base.copy(), self._points.copy(), self._base_light.copy()
         changed = np.zeros(width * height, dtype=bool)
@@ -381,7 +385,7 @@ class Studio:
             (left, top), (right, bottom) = self._window(body, pose)
             window = (np.arange(top, bottom)[:, None] * width + np.arange(left, right)).reshape(-1)
             which, surface = body.hit(pose, self._eye, self._rays[window])
-            changed[seen.put(window[which], surface, number + SIGN * body.sign)] = True
+            changed[seen.put(window[which], surface, number + body.rank)] = True
         fresh = np.flatnonzero(changed)
         points[fresh] = self._points_of(seen, fresh)
         light[fresh] = self._passed([self._still], points[fresh], seen.normal[fresh], self._cell[fresh])
@@ -493,7 +497,7 @@ class Studio:
             inside = np.flatnonzero((x >= left) & (x < right) & (y >= top) & (y < bottom))
             inside = (inside[:, None] * count + np.arange(count)).reshape(-1)
             which, surface = body.hit(pose, self._eye, rays[inside])
-            fine.put(inside[which], surface, number + SIGN * body.sign)
+            fine.put(inside[which], surface, number + body.rank)
         # The light is that of the pixel, or of a neighbour that shows the same surface.
         share = np.repeat(light[edges], count, axis=0)
         left = np.arange(len(rays))

@@ -96,7 +96,7 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
     predicted = ("prediction", "flow") in frames[0].keys(include_nested=True)
     flow = ("prediction", "flow") if predicted else ("privileged", "flow")
     kept: dict[str, NDArray[Any]] = {
-        key: torch.stack([frame[where] for frame in frames]).numpy()
+        key: torch.stack([frame[where] for frame in frames]).cpu().numpy()
         for key, where in {
             "tool": ("observation", "tool_pose"),
             "points": ("observation", "points"),

@@ -88,10 +88,10 @@ class Stage:
         for leader, members in groups.items():
             to_leader = np.linalg.inv(film.poses[0, leader])
             parts = [Part(meshes[i], colors[i], to_leader @ film.poses[0, i]) for i in members]
-            self.moving.append((Body(parts), leader))
+            self.moving.append((Body(parts, opaque=leader >= count), leader))
         cup = _cup(max(float(mesh.vertices[:, 0].max()) for finger in film.gripper for mesh in finger))
         self._hand = count
-        self._cups = {held: Body([Part([cup], color)]) for held, color in ((False, FREE), (True, HOLDING))}
+        self._cups = {held: Body([Part([cup], color)], opaque=True) for held, color in ((False, FREE), (True, HOLDING))}
         self._anchors = _anchors(film)
         bounds = standing_bounds(film.obj)
         self._centre, self._span = bounds.mean(0), float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -116,7 +116,8 @@ class Stage:
             outlines.append(starts + self._length * flows)
         for body, leader in [*self.moving, (self._cups[False], self._hand)]:
             poses = self.film.poses[around if leader >= self._hand else slice(None), leader]
-            outlines.append((body.outline() @ poses[:, :3, :3].mT + poses[:, None, :3, 3]).reshape(-1, 3))
+            turned = np.einsum("tij,pj->tpi", poses[:, :3, :3], body.outline())
+            outlines.append((turned + poses[:, None, :3, 3]).reshape(-1, 3))
         return np.concatenate(outlines)
 
     def _best_view(self) -> View:
@@ -244,9 +245,9 @@ def _state(film: Film, t: int) -> str:
     return f"step {t} · {100 * film.opened[t]:.0f} % opened"
 
 
-def frames(film: Film, size: tuple[int, int] = SIZE) -> Iterator[NDArray[np.uint8]]:
+def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -> Iterator[NDArray[np.uint8]]:
     """The film's pictures of that ``size`` with a caption below each: one for each moment, [H + CAPTION, W, 3]."""
-    stage = Stage(film, *size)
+    stage = Stage(film, *size, view)
     width, height = size
     small, usual = _font(12), _font(13)
     middle = height + CAPTION // 2 + 2
@@ -279,9 +280,12 @@ def moments(film: Film) -> list[tuple[str, int]]:
         gain = film.opened[last] - film.opened[contact]
         found = [("start", 0), ("pre-contact", before), ("contact", contact)]
         for name, share in (("one third", 1 / 3), ("two thirds", 2 / 3)):
-            reached = np.flatnonzero(film.opened[contact:] - film.opened[contact] >= share * gain)
-            by_time = round(share * (last - contact))
-            found.append((name, contact + int(reached[0] if gain > 0.05 else by_time)))
+            if gain > 0.3:
+                reached = film.opened[contact:] - film.opened[contact] >= share * gain
+                found.append((name, contact + int(reached.argmax())))
+            else:
+                t = contact + round(share * (last - contact))
+                found.append((f"step {t}", t))
     else:
         found = [("start", 0)] + [(f"step {t}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
     end = ("opened" if film.success else "end", last)
@@ -323,7 +327,7 @@ _ENCODERS: dict[str, tuple[str, str, list[str]]] = {
 }  # fmt: skip
 
 
-def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE) -> None:
+def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View | None = None) -> None:
     """Write the film in real time, the last moment held: H.264 that browsers play, or by its suffix a GIF.
 
     The same film gives the same bytes: one thread encodes, and neither date nor version goes into the file.
@@ -332,6 +336,7 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE) -> None:
         film: the film.
         path: ends in ``.mp4`` or ``.gif``.
         size: width and height of the pictures, even numbers of pixels; the caption comes below.
+        view: see :class:`Stage`.
     """
     codec, pixels, options = _ENCODERS[path.suffix]
     same = [
@@ -359,19 +364,19 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE) -> None:
             output_params=options + same,
         )
         writer.send(None)
-        for image in frames(film, size):
+        for image in frames(film, size, view):
             writer.send(image)
         for _ in range(round(HOLD * film.rate)):
             writer.send(image)
         writer.close()
 
 
-def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH) -> None:
+def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View | None = None) -> None:
     """Write a PNG of that ``width`` (pixels): the film's :func:`moments` side by side, with a caption below each."""
     shown = moments(film)
     gap, line = width // 130, width // 70
     side = (width - gap * (len(shown) - 1)) // len(shown)
-    stage = Stage(film, 2 * side)
+    stage = Stage(film, 2 * side, view=view)
     tall = stage.camera.size[1] // 2
     bold, usual = _font(width // 100, bold=True), _font(width // 114)
     top = round(1.4 * line)
@@ -433,12 +438,16 @@ def film_trials(
     chosen = set(trials_to_film(rows, count))
     wanted = [row for row in rows if row.trial in chosen and row.status == "ok"]
     by_id = {obj.id: obj for obj in objects}
+    views: dict[int, View] = {}
     folder.mkdir(parents=True, exist_ok=True)
     for done, row in enumerate(wanted):
         progress(done, len(wanted))
         film = record(row.policy, policies[row.policy], by_id[row.object], scheduled[row.trial].trial, options)
         # Names in strangers' files may hold any character.
         name = re.sub(r"[^\w.-]", "_", f"{row.trial:03d}_{row.object}_{row.link}_{row.policy}", flags=re.ASCII)
-        write_video(film, folder / f"{name}.mp4")
-        write_filmstrip(film, folder / f"{name}.png")
+        # All policies are seen from the same side.
+        if row.trial not in views:
+            views[row.trial] = Stage(film, *SIZE).view
+        write_video(film, folder / f"{name}.mp4", SIZE, views[row.trial])
+        write_filmstrip(film, folder / f"{name}.png", view=views[row.trial])
     progress(len(wanted), len(wanted))

@@ -181,6 +181,9 @@ def test_signs_neither_throw_shadows_nor_hide_behind_things() -> None:
     assert changed.sum() > 50 and 0 < GHOST < 1
     tint = (hidden - plain)[changed]
     assert (tint[:, 1] > tint[:, 0]).all() and not is_color(hidden, GREEN).all()
+    opaque = Body([Part([box((0.05, 0.8, 0.8))], (0.8, 0.8, 0.8))], opaque=True)
+    shown = shoot(Body([]), (opaque, at(0, 0, 0.4)), (sign, at(0.5, 0, 0.4)), view=FRONT)
+    np.testing.assert_array_equal(shown, shoot(Body([]), (opaque, at(0, 0, 0.4)), view=FRONT))
     body_of_it = body(GREEN, box((0.1, 0.2, 0.2)))
     np.testing.assert_array_equal(
         is_color(shoot(wall, (body_of_it, at(0.5, 0, 0.4)), view=FRONT), GREEN), np.zeros(SIZE[::-1], dtype=bool)
