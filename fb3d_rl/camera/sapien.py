@@ -79,21 +79,21 @@ def add_visuals(entity: sapien.Entity, meshes: Sequence[Mesh], index: int) -> No
     """
     if not meshes:
         return
-    vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
-    first = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
-    faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)])
+    corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])  # [F, 3, 3]
     # SAPIEN draws front faces only, and the faces of real objects look either way: draw both sides.
-    faces = np.concatenate([faces, faces[:, ::-1]]).astype(np.uint32)
+    corners = np.concatenate([corners, corners[:, ::-1]])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-30)
+    vertices = corners.reshape(-1, 3).astype(np.float32)
     shape = sapien.render.RenderShapeTriangleMesh(
         vertices,
-        faces,
-        np.zeros_like(vertices),
+        np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3),
+        normals.repeat(3, axis=0).astype(np.float32),  # edges stay sharp: every face has its own corners
         np.zeros_like(vertices[:, :2]),
         sapien.render.RenderMaterial(base_color=[*colorsys.hsv_to_rgb(0.618034 * index % 1.0, 0.45, 0.9), 1.0]),
     )
     body = sapien.render.RenderBodyComponent()
     body.attach(shape)
-    body.shading_mode = 1  # flat: by the faces' own normals
     entity.add_component(body)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.registration import register
 from mani_skill.utils.structs import Articulation
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
@@ -22,6 +24,7 @@ from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import find_objects
+from fb3d_rl.camera.sapien import SENSOR, SapienCamera, add_visuals, camera_config, require_renderer
 from fb3d_rl.contract import ACTION_DIM, UserError
 from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
@@ -72,14 +75,16 @@ class OpenArticulatedEnv(BaseEnv):
         split: of a folder of many objects, those of this split, category or id (a name or a list).
         link: name of the link to open, where it is always the same.
         num_envs: environments that run side by side; more than one need CUDA.
-        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "state" (flat), "state_dict", "rgbd" (needs
-            Vulkan) or "none"; ``reward_mode`` "normalized_dense" or "sparse".
+        kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "rgbd" ("rgb" [H, W, 3] uint8 and "depth"
+            [H, W, 1] float32, m, in place of points; needs Vulkan), "state" (flat), "state_dict" or "none";
+            ``reward_mode`` is "normalized_dense" or "sparse"; ``render_backend`` "cpu" or "gpu" draws
+            ``render_mode="rgb_array"`` with SAPIEN.
 
     Raises:
         UserError: there is no object, none has something to open, or a renderer is asked for that is not there.
     """
 
-    SUPPORTED_OBS_MODES = ("pointcloud", "state", "state_dict", "none")
+    SUPPORTED_OBS_MODES = ("pointcloud", "rgbd", "state", "state_dict", "none")
     SUPPORTED_REWARD_MODES = ("normalized_dense", "sparse", "none")
     SUPPORTED_ROBOTS = [FloatingSuctionGripper.uid]
     agent: FloatingSuctionGripper
@@ -105,6 +110,8 @@ class OpenArticulatedEnv(BaseEnv):
         self._models: dict[str, Model] = {}
         self._trial_rng = np.random.default_rng(0)
         self._contact = torch.zeros(0)
+        if self.options.camera.kind == "sapien" or kwargs.get("obs_mode") == "rgbd":
+            kwargs.setdefault("render_backend", require_renderer())
         super().__init__(
             num_envs=num_envs,
             robot_uids=FloatingSuctionGripper.uid,
@@ -154,6 +161,9 @@ class OpenArticulatedEnv(BaseEnv):
         )
         if not full and not same:
             raise UserError("another object needs a reset of all environments, since the whole scene is built anew")
+        if not full and self.scene.can_render():
+            if any(self.stages[i].trial.view != trial.view for i, trial in zip(which, trials, strict=True)):
+                raise UserError("the rendered camera moves in a reset of all environments only; keep the view")
         # On CUDA building is slow and bits differ between runs in any case.
         build = full and not (same and self.device.type == "cuda")
         if build:
@@ -200,7 +210,7 @@ class OpenArticulatedEnv(BaseEnv):
         self._close_viewer()
         self.scene = None
         self.__dict__.pop("agent", None)
-        for name in ("articulation", "_built", "_impulses"):
+        for name in ("articulation", "_built", "_impulses", "_rendered"):
             self.__dict__.pop(name, None)
 
     def _load_agent(self, options: dict[str, Any]) -> None:
@@ -233,6 +243,10 @@ class OpenArticulatedEnv(BaseEnv):
             entity = sapien.Entity()
             entity.add_component(stage.static)
             stage.scene.add_entity(entity)
+            if self.scene.can_render():
+                visuals = [*(link.visuals for link in stage.object.links), *stage.model.gripper]
+                for i, (body, meshes) in enumerate(zip((*stage.links, *stage.bodies), visuals, strict=True)):
+                    add_visuals(body.entity, meshes, i)
         self._built = built
         # One view of all objects, whose joint states are padded to the longest.
         self.articulation = Articulation.merge(built, name="object")
@@ -241,6 +255,24 @@ class OpenArticulatedEnv(BaseEnv):
         self._columns = torch.zeros(self.num_envs, joints, dtype=torch.int64, device=self.device)
         for row, stage in zip(self._columns, self.stages, strict=True):
             row[: len(stage.order)] = torch.tensor(stage.order)
+
+    def _camera_poses(self) -> NDArray[np.float64]:
+        """T_world_camera [E, 4, 4]."""
+        return np.stack([stage.model.camera.pose(stage.trial.view) for stage in self.stages])
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        return [camera_config(self.options.camera, self._camera_poses())]
+
+    @property
+    def _default_human_render_camera_configs(self) -> list[CameraConfig]:
+        picture = replace(self.options.camera, resolution=512, shader="default")
+        return [replace(camera_config(picture, self._camera_poses()), uid="render_camera")]
+
+    def _after_reconfigure(self, options: dict[str, Any]) -> None:
+        if self.scene.can_render():
+            bodies = [[link.entity for link in stage.links] for stage in self.stages]
+            self._rendered = SapienCamera(self._sensors[SENSOR], self.options.camera, self._camera_poses(), bodies)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
         stages = [self.stages[e] for e in env_idx.tolist()]
@@ -383,6 +415,10 @@ class OpenArticulatedEnv(BaseEnv):
                 "joint_position": self.joint_positions().gather(1, self._target),
             },
         }
+        if self._obs_mode == "rgbd" or (self._obs_mode == "pointcloud" and self.options.camera.kind == "sapien"):
+            self._rendered.capture()
+        if self._obs_mode == "rgbd":
+            obs["observation"]["rgb"], obs["observation"]["depth"] = self._rendered.rgbd()
         if self._obs_mode == "pointcloud":
             clouds = self._stacked([self._cloud(e, pose) for e, pose in enumerate(poses)])
             for key in ("points", "valid", "part_mask"):
@@ -400,7 +436,10 @@ class OpenArticulatedEnv(BaseEnv):
     def _cloud(self, e: int, poses: NDArray[np.float64]) -> dict[str, Tensor]:
         """What the camera of environment ``e`` sees, and the ground-truth flow of it."""
         stage = self.stages[e]
-        seen = stage.model.camera.capture(poses, stage.trial.view, further=False)
+        if self.options.camera.kind == "sapien":
+            seen = self._rendered.cloud(e)
+        else:
+            seen = stage.model.camera.capture(poses, stage.trial.view, further=False)
         # A generator for each step, so that a restored state sees the same points again.
         rng = np.random.default_rng([stage.trial.seed, int(self._elapsed_steps[e])])
         cloud, ids = sample_cloud(*seen, self.options.points, rng)
