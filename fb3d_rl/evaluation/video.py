@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
 from pathlib import Path
@@ -79,19 +79,25 @@ class Stage:
         count = len(film.obj.links)
         target = set(film.obj.descendants(film.link))
         movable = {i for link in film.obj.movable for i in film.obj.descendants(link)}
+        # The suction cup, the last body, moves with the hand, the first after the links.
+        poses = np.concatenate([film.poses, film.poses[:, [count]]], axis=1)
+        meshes = [*(link.visuals for link in film.obj.links), *film.gripper, [_cup(film.gripper)]]
         colors = [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(count)] + [GRIPPER] * 3
-        meshes = [link.visuals for link in film.obj.links] + list(film.gripper)
-        still, groups = _rigid_groups(film.poses)
-        self.still = Body(Part(meshes[i], colors[i], film.poses[0, i]) for i in still)
-        self.moving: list[tuple[Body, int]] = []
-        """Bodies with the number of the link that each moves with."""
-        for leader, members in groups.items():
-            to_leader = np.linalg.inv(film.poses[0, leader])
-            parts = [Part(meshes[i], colors[i], to_leader @ film.poses[0, i]) for i in members]
-            self.moving.append((Body(parts, opaque=leader >= count), leader))
-        cup = _cup(max(float(mesh.vertices[:, 0].max()) for finger in film.gripper for mesh in finger))
-        self._hand = count
-        self._cups = {held: Body([Part([cup], color)], opaque=True) for held, color in ((False, FREE), (True, HOLDING))}
+
+        def bodies(groups: Sequence[Sequence[int]], cup: Color = FREE) -> list[tuple[Body, int]]:
+            made = []
+            for members in groups:
+                to_body = np.linalg.inv(poses[0, members[0]])
+                parts = [Part(meshes[i], [*colors, cup][i], to_body @ poses[0, i]) for i in members]
+                made.append((Body(parts, opaque=members[0] >= count), members[0]))
+            return made
+
+        # The object's root stands still, and so does all that is fixed to it.
+        standing, *sliding = _rigid_groups(poses, range(count))
+        self._still = Body(Part(meshes[i], colors[i], poses[0, i]) for i in standing)
+        self._parts = bodies(sliding)
+        gripper = _rigid_groups(poses, range(count, count + 4))
+        self._gripper = {held: bodies(gripper, HOLDING if held else FREE) for held in (False, True)}
         self._anchors = _anchors(film)
         bounds = standing_bounds(film.obj)
         self._centre, self._span = bounds.mean(0), float(np.linalg.norm(bounds[1] - bounds[0]))
@@ -102,20 +108,20 @@ class Stage:
             across, down = np.ptp(Camera.fitting(self.view, extent, (width, width)).project(extent), axis=0)
             height = round(width * float(np.clip(down / across, 0.8, 1.3)))
         self.camera = Camera.fitting(self.view, extent, (width, height))
-        self._studio = Studio(self.camera, self.still)
+        self._studio = Studio(self.camera, self._still)
 
     def _extent(self) -> NDArray[np.float64]:
         """Points [P, 3] (m) that have to be in the picture: the outlines of all bodies at all times, and arrows.
 
         A gripper that flies far off leaves the picture.
         """
-        outlines = [self.still.outline()]
+        outlines = [self._still.outline()]
         around = np.linalg.norm(self.film.tips - self._centre, axis=-1) < 1.2 * self._span
         for _, t in moments(self.film):
             starts, flows = self.arrows(t)
             outlines.append(starts + self._length * flows)
-        for body, leader in [*self.moving, (self._cups[False], self._hand)]:
-            poses = self.film.poses[around if leader >= self._hand else slice(None), leader]
+        for body, leader in [*self._parts, *self._gripper[False]]:
+            poses = self.film.poses[around if leader >= len(self.film.obj.links) else slice(None), leader]
             turned = np.einsum("tij,pj->tpi", poses[:, :3, :3], body.outline())
             outlines.append((turned + poses[:, None, :3, 3]).reshape(-1, 3))
         return np.concatenate(outlines)
@@ -127,14 +133,13 @@ class Stage:
         for _, t in moments(film):
             starts, flows = self.arrows(t)
             points = np.concatenate([film.tips[[t]], starts]).astype(np.float32)
-            # The gripper is left out: it hides little of the part, and the tip is its own.
-            solid = [(body, film.poses[t, leader]) for body, leader in self.moving if leader < self._hand]
             for number, view in enumerate(views):
                 outward = -look_at(view, np.zeros(3), 1.0)[:3, 2].astype(np.float32)
                 rays = np.tile(outward, (len(points), 1))
-                hidden = self.still.blocks(np.eye(4), points + 0.02 * rays, rays, np.inf)
-                for body, pose in solid:
-                    hidden |= body.blocks(pose, points + 0.02 * rays, rays, np.inf)
+                hidden = self._still.blocks(np.eye(4), points + 0.02 * rays, rays, np.inf)
+                # The gripper is left out: it hides little of the part, and the tip is its own.
+                for body, leader in self._parts:
+                    hidden |= body.blocks(film.poses[t, leader], points + 0.02 * rays, rays, np.inf)
                 across = np.linalg.norm(np.cross(flows, outward), axis=-1)
                 shown = float(~hidden[0]) + (across * ~hidden[1:]).sum() / max(len(flows), 1)
                 # The root prefers a view that always shows something to one that shows much at times.
@@ -159,27 +164,26 @@ class Stage:
         """The image [H, W, 3] of moment ``t``."""
         starts, flows = self.arrows(t)
         signs = Body([Part(_arrows(starts, self._length * flows, 0.13 * self._length), FLOW)], sign=True)
-        cup = self._cups[bool(self.film.attached[t])]
-        moving: list[Placed] = [(body, self.film.poses[t, leader]) for body, leader in self.moving]
-        return self._studio.picture([*moving, (cup, self.film.poses[t, self._hand]), (signs, np.eye(4))])
+        bodies = [*self._parts, *self._gripper[bool(self.film.attached[t])]]
+        moving: list[Placed] = [(body, self.film.poses[t, leader]) for body, leader in bodies]
+        return self._studio.picture([*moving, (signs, np.eye(4))])
 
 
-def _rigid_groups(poses: NDArray[np.float64]) -> tuple[list[int], dict[int, list[int]]]:
-    """Bodies of ``poses`` [T, B, 4, 4] that never move, and for each other leader those that move with it."""
-    still: list[int] = []
-    groups: dict[int, list[int]] = {}
-    for i in range(poses.shape[1]):
-        if np.ptp(poses[:, i], axis=0).max() < 1e-4:
-            still.append(i)
-            continue
-        for leader in groups:
-            relative = np.linalg.inv(poses[:, leader]) @ poses[:, i]
-            if np.ptp(relative, axis=0).max() < 1e-4:
-                groups[leader].append(i)
+def _rigid_groups(poses: NDArray[np.float64], among: Iterable[int], slack: float = 2e-3) -> list[list[int]]:
+    """Bodies ``among`` those of ``poses`` [T, B, 4, 4], in groups whose members keep their places in the first's frame.
+
+    The ``slack`` (m, or rad) is less than a pixel; the fingers have as much play.
+    """
+    groups: list[list[int]] = []
+    for i in among:
+        for group in groups:
+            relative = np.linalg.inv(poses[:, group[0]]) @ poses[:, i]
+            if np.ptp(relative, axis=0).max() < slack:
+                group.append(i)
                 break
         else:
-            groups[i] = [i]
-    return still, groups
+            groups.append([i])
+    return groups
 
 
 def _anchors(film: Film) -> NDArray[np.float64]:
@@ -202,8 +206,9 @@ def _turned(profile: Sequence[tuple[float, float]], sections: int) -> Mesh:
     return Mesh(np.asarray(made.vertices, dtype=np.float64), np.asarray(made.faces, dtype=np.int64))
 
 
-def _cup(end: float) -> Mesh:
-    """A suction cup about the hand's x axis whose rim is at x = ``end`` m: only to be seen, not felt."""
+def _cup(gripper: Sequence[Sequence[Mesh]]) -> Mesh:
+    """A suction cup at the fingers' ends, about the hand's x axis: only to be seen, not felt."""
+    end = max(float(mesh.vertices[:, 0].max()) for meshes in gripper for mesh in meshes)
     made = _turned([(0, -0.06), (0.014, -0.06), (0.016, -0.04), (0.036, 0.002), (0, 0.002)], 24)
     return Mesh(made.vertices[:, [2, 0, 1]] + [end, 0, 0], made.faces)
 
