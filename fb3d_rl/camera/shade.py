@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fb3d_rl.assets.articulation import Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.views import View, look_at
 from fb3d_rl.contract import UserError
 
@@ -64,6 +64,22 @@ FAR = 1e6
 
 GROUND, NOTHING, OPAQUE, SIGN = -1, -2, 1000, 2000
 """Numbers of the ground and of the empty background among those of bodies, and the first of opaque ones and signs."""
+
+
+def srgb(code: str) -> Color:
+    """The color of a code such as "#3f7fd0"."""
+    red, green, blue = (int(code[i : i + 2], 16) / 255 for i in (1, 3, 5))
+    return red, green, blue
+
+
+STATIC, MOVABLE, TARGET, GRIPPER = srgb("#cdd2d9"), srgb("#aebccd"), srgb("#3f7fd0"), srgb("#3a3f47")
+
+
+def link_colors(obj: ArticulatedObject, link: int) -> list[Color]:
+    """Colors of the object's links: what ``link`` carries, what else can move, what stands."""
+    target = set(obj.descendants(link))
+    movable = {i for each in obj.movable for i in obj.descendants(each)}
+    return [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(len(obj.links))]
 
 
 @dataclass(frozen=True, eq=False)

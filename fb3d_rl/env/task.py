@@ -25,6 +25,7 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.camera.sapien import SENSOR, SapienCamera, add_visuals, camera_config, require_renderer
+from fb3d_rl.camera.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
 from fb3d_rl.contract import ACTION_DIM, UserError
 from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
@@ -35,6 +36,9 @@ from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 TASK = "OpenArticulated-v1"
 """The task's name for ``gymnasium.make``."""
+
+PICTURE = 512
+"""Width and height (pixels) of what ``render()`` returns."""
 
 VIEW_TRIES = 8
 """Views that are drawn at most until one shows the part to open."""
@@ -266,7 +270,7 @@ class OpenArticulatedEnv(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> list[CameraConfig]:
-        picture = replace(self.options.camera, resolution=512, shader="default")
+        picture = replace(self.options.camera, resolution=PICTURE, shader="default")
         return [replace(camera_config(picture, self._camera_poses()), uid="render_camera")]
 
     def _after_reconfigure(self, options: dict[str, Any]) -> None:
@@ -455,6 +459,22 @@ class OpenArticulatedEnv(BaseEnv):
             "flow": normalize_flow(flow),
             "link": link,
         }
+
+    # --------------------------------------------------------------------------------------------- pictures
+
+    def render_rgb_array(self, camera_name: str | None = None) -> Tensor:
+        """Pictures [E, H, W, 3] uint8 of the scenes: by SAPIEN where it renders, else shaded on the CPU."""
+        if self.scene.can_render():
+            pictures: Tensor = super().render_rgb_array(camera_name)
+            return pictures
+        return torch.from_numpy(np.stack([self._shaded(stage) for stage in self.stages]))
+
+    def _shaded(self, stage: Stage) -> NDArray[np.uint8]:
+        meshes = [*(link.visuals for link in stage.object.links), *stage.model.gripper]
+        colors = [*link_colors(stage.object, stage.trial.link), *[GRIPPER] * len(stage.bodies)]
+        body = Body(Part(*each) for each in zip(meshes, colors, stage.poses(), strict=True))
+        camera = Camera.fitting(stage.trial.view, body.outline(), (PICTURE, PICTURE))
+        return Studio(camera, body).picture()
 
     # ------------------------------------------------------------------------------------------------ state
 

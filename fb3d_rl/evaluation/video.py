@@ -19,7 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
-from fb3d_rl.camera.shade import Body, Camera, Color, Part, Placed, Studio
+from fb3d_rl.camera.shade import GRIPPER, TARGET, Body, Camera, Color, Part, Placed, Studio, link_colors, srgb
 from fb3d_rl.camera.views import View, look_at
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions
@@ -51,13 +51,7 @@ VIEWS = tuple(
 """Directions that a film may be drawn from, beside the one of the policy's camera."""
 
 
-def _color(code: str) -> Color:
-    red, green, blue = (int(code[i : i + 2], 16) / 255 for i in (1, 3, 5))
-    return red, green, blue
-
-
-STATIC, MOVABLE, TARGET = _color("#cdd2d9"), _color("#aebccd"), _color("#3f7fd0")
-GRIPPER, FREE, HOLDING, FLOW = _color("#3a3f47"), _color("#e5383b"), _color("#14c99a"), _color("#ff8c1a")
+FREE, HOLDING, FLOW = srgb("#e5383b"), srgb("#14c99a"), srgb("#ff8c1a")
 INK, FAINT, TRACK = "#22262b", "#6b7480", "#dfe4ea"
 
 
@@ -77,12 +71,10 @@ class Stage:
     def __init__(self, film: Film, width: int, height: int | None = None, view: View | None = None) -> None:
         self.film = film
         count = len(film.obj.links)
-        target = set(film.obj.descendants(film.link))
-        movable = {i for link in film.obj.movable for i in film.obj.descendants(link)}
         # The suction cup, the last body, moves with the hand, the first after the links.
         poses = np.concatenate([film.poses, film.poses[:, [count]]], axis=1)
         meshes = [*(link.visuals for link in film.obj.links), *film.gripper, [_cup(film.gripper)]]
-        colors = [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(count)] + [GRIPPER] * 3
+        colors = [*link_colors(film.obj, film.link), *[GRIPPER] * 3]
 
         def bodies(groups: Sequence[Sequence[int]], cup: Color = FREE) -> list[tuple[Body, int]]:
             made = []

@@ -289,6 +289,20 @@ def test_impossible_actions_are_refused(
     torch.testing.assert_close(env.get_state(), state, atol=0, rtol=0)
 
 
+def test_pictures_need_no_renderer(objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["Table"]
+    env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS), render_mode="rgb_array")
+    drawer = links_called(obj, "drawer")[0]
+    place_before(env, drawer, start(env, obj, drawer))
+    before = env.render()
+    assert before.shape == (1, 512, 512, 3) and before.dtype == torch.uint8
+    assert torch.equal(env.render(), before)
+    state = env.joint_positions()[0].double()
+    state[env.stages[0].target] = env.stages[0].goal
+    set_joints(env, state)
+    assert (env.render() != before).any(-1).float().mean() > 0.01, "the drawer is out"
+
+
 def test_nothing_is_rendered(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
     start(env, objects["Table"], objects["Table"].movable[0])
     assert not env.scene.can_render()
