@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import sapien
 import torch
+from mani_skill import logger
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.registration import register
@@ -33,6 +34,8 @@ from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage
 from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
+
+logger.addFilter(lambda record: "does not support rendering" not in record.getMessage())  # it draws without
 
 TASK = "OpenArticulated-v1"
 """The task's name for ``gymnasium.make``."""

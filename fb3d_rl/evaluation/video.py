@@ -58,7 +58,7 @@ INK, FAINT, TRACK = "#22262b", "#6b7480", "#dfe4ea"
 # ------------------------------------------------------------------------------------------------------ pictures
 
 
-class Stage:
+class Shot:
     """A film's bodies before a camera that sees all of what happens.
 
     Args:
@@ -244,13 +244,13 @@ def _state(film: Film, t: int) -> str:
 
 def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -> Iterator[NDArray[np.uint8]]:
     """The film's pictures of that ``size`` with a caption below each: one for each moment, [H + CAPTION, W, 3]."""
-    stage = Stage(film, *size, view)
+    shot = Shot(film, *size, view)
     width, height = size
     small, usual = _font(12), _font(13)
     middle = height + CAPTION // 2 + 2
     for t in range(len(film)):
         image = Image.new("RGB", (width, height + CAPTION), "white")
-        image.paste(Image.fromarray(stage.picture(t)))
+        image.paste(Image.fromarray(shot.picture(t)))
         draw = ImageDraw.Draw(image)
         draw.text((10, 8), _title(film), FAINT, small)
         draw.rectangle((0, height, width, height + 3), TRACK)
@@ -333,7 +333,7 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View
         film: the film.
         path: ends in ``.mp4`` or ``.gif``.
         size: width and height of the pictures, even numbers of pixels; the caption comes below.
-        view: see :class:`Stage`.
+        view: see :class:`Shot`.
     """
     codec, pixels, options = _ENCODERS[path.suffix]
     same = [
@@ -373,8 +373,8 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
     shown = moments(film)
     gap, line = width // 130, width // 70
     side = (width - gap * (len(shown) - 1)) // len(shown)
-    stage = Stage(film, 2 * side, view=view)
-    tall = stage.camera.size[1] // 2
+    shot = Shot(film, 2 * side, view=view)
+    tall = shot.camera.size[1] // 2
     bold, usual = _font(width // 100, bold=True), _font(width // 114)
     top = round(1.4 * line)
     image = Image.new("RGB", (width, top + tall + 3 * line), "white")
@@ -382,7 +382,7 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
     draw.text((0, 0), _title(film), FAINT, usual)
     for place, (name, t) in enumerate(shown):
         left, below = place * (side + gap), top + tall + line // 3
-        picture = Image.fromarray(stage.picture(t)).resize((side, tall), Image.Resampling.BOX)
+        picture = Image.fromarray(shot.picture(t)).resize((side, tall), Image.Resampling.BOX)
         image.paste(picture, (left, top))
         draw.text((left, below), name, INK, bold)
         draw.text((left, below + round(1.1 * line)), _state(film, t), FAINT, usual)
@@ -444,7 +444,7 @@ def film_trials(
         name = re.sub(r"[^\w.-]", "_", f"{row.trial:03d}_{row.object}_{row.link}_{row.policy}", flags=re.ASCII)
         # All policies are seen from the same side.
         if row.trial not in views:
-            views[row.trial] = Stage(film, *SIZE).view
+            views[row.trial] = Shot(film, *SIZE).view
         write_video(film, folder / f"{name}.mp4", SIZE, views[row.trial])
         write_filmstrip(film, folder / f"{name}.png", view=views[row.trial])
     progress(len(wanted), len(wanted))

@@ -31,7 +31,7 @@ from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.evaluation.video import (
     CAPTION,
     HOLD,
-    Stage,
+    Shot,
     film_trials,
     frames,
     moments,
@@ -121,9 +121,9 @@ def centre(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def test_the_part_to_open_is_blue_and_moves_as_its_joint_opens(film: Film) -> None:
-    stage = Stage(film, *SMALL)
-    seen = [centre(matches(stage.picture(t), video.TARGET)) for t in (10, 15, 20)]
-    moved = stage.camera.project(np.array([[-0.6, 0, 0.5], [-0.6 - OPENING, 0, 0.5]]))
+    shot = Shot(film, *SMALL)
+    seen = [centre(matches(shot.picture(t), video.TARGET)) for t in (10, 15, 20)]
+    moved = shot.camera.project(np.array([[-0.6, 0, 0.5], [-0.6 - OPENING, 0, 0.5]]))
     wanted = moved[1] - moved[0]
     for before, after in zip(seen, seen[1:], strict=False):
         step = after - before
@@ -134,59 +134,59 @@ def test_the_part_to_open_is_blue_and_moves_as_its_joint_opens(film: Film) -> No
 @pytest.mark.parametrize("flow", [(-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (-0.5, -0.5, 0.5)])
 def test_an_arrow_points_where_the_flow_points_in_the_image(flow: tuple[float, float, float]) -> None:
     film = made_film(flow, rows=1)
-    stage = Stage(film, *SMALL, view=View(-30.0, 25.0))
-    starts, flows = stage.arrows(0)
+    shot = Shot(film, *SMALL, view=View(-30.0, 25.0))
+    starts, flows = shot.arrows(0)
     assert len(starts) == 1
     np.testing.assert_allclose(starts[0], film.points[0, 0], atol=1e-6)
     np.testing.assert_allclose(flows[0], flow, atol=1e-6)
-    ends = stage.camera.project(np.stack([starts[0], starts[0] + 0.1 * flows[0]]))
+    ends = shot.camera.project(np.stack([starts[0], starts[0] + 0.1 * flows[0]]))
     direction = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    arrow = matches(stage.picture(0), video.FLOW)
+    arrow = matches(shot.picture(0), video.FLOW)
     offset = centre(arrow) - ends[0]
     # The head is wide, so the arrow's centre lies well ahead of its start.
     assert offset @ direction > 3 and np.abs(offset - (offset @ direction) * direction).max() < 2.5
 
 
 def test_arrows_stand_on_the_part_and_move_with_it(film: Film) -> None:
-    stage = Stage(film, *SMALL)
-    early, late = stage.arrows(10)[0], stage.arrows(20)[0]
+    shot = Shot(film, *SMALL)
+    early, late = shot.arrows(10)[0], shot.arrows(20)[0]
     assert len(early) == len(late) == 16
     np.testing.assert_allclose(late - early, np.tile([-OPENING, 0, 0], (16, 1)), atol=1e-5)
     hidden = replace(film, part=np.zeros_like(film.part))
-    assert len(Stage(hidden, *SMALL).arrows(0)[0]) == 0, "no arrows where the policy sees nothing of the part"
-    Stage(hidden, *SMALL).picture(0)
+    assert len(Shot(hidden, *SMALL).arrows(0)[0]) == 0, "no arrows where the policy sees nothing of the part"
+    Shot(hidden, *SMALL).picture(0)
 
 
 def test_the_gripper_is_seen_and_its_tip_changes_colour_when_it_holds(film: Film) -> None:
-    stage = Stage(replace(film, flow=np.zeros_like(film.flow)), *SMALL, view=View(-50.0, 20.0))
+    shot = Shot(replace(film, flow=np.zeros_like(film.flow)), *SMALL, view=View(-50.0, 20.0))
     for t in (0, 5, 12, 20):
-        image = stage.picture(t)
-        column, row = stage.camera.project(film.poses[t, 2, :3, 3][None])[0].astype(int)
+        image = shot.picture(t)
+        column, row = shot.camera.project(film.poses[t, 2, :3, 3][None])[0].astype(int)
         around = image[row - 2 : row + 3, column - 2 : column + 3].max(-1)
         assert around.min() < 90, f"the dark hand at step {t}"
         held, free = (matches(image, color).sum() for color in (video.HOLDING, video.FREE))
         assert (held > free) == film.attached[t] and max(held, free) > 3
     aside = replace(film, poses=film.poses.copy())
     aside.poses[:, 2:, 0, 3] += 100.0
-    assert not matches(Stage(aside, *SMALL).picture(0), video.FREE).any()
+    assert not matches(Shot(aside, *SMALL).picture(0), video.FREE).any()
 
 
 def test_all_that_happens_is_in_the_picture_but_a_gripper_that_flies_off(film: Film) -> None:
-    stage = Stage(film, *SMALL)
-    ends = stage.camera.project(np.concatenate([film.tips, film.points[:, :-1].reshape(-1, 3)]))
+    shot = Shot(film, *SMALL)
+    ends = shot.camera.project(np.concatenate([film.tips, film.points[:, :-1].reshape(-1, 3)]))
     assert (ends > 0).all() and (ends < SMALL).all()
     off = replace(film, poses=film.poses.copy(), tips=film.tips.copy())
     off.poses[15:, 2:, 2, 3] += 20.0
     off.tips[15:, 2] += 20.0
-    assert Stage(off, *SMALL).camera.pose[2, 3] < 1.5 * stage.camera.pose[2, 3]
+    assert Shot(off, *SMALL).camera.pose[2, 3] < 1.5 * shot.camera.pose[2, 3]
 
 
 def test_the_view_shows_the_flow() -> None:
     """The front slides along -x: seen from the very front the arrows would be dots, from behind nothing would."""
     film = replace(made_film(), view=View(0.0, 20.0))
-    stage = Stage(film, *SMALL)
-    assert 20 <= abs(stage.view.azimuth) <= 60
-    assert Stage(film, *SMALL, view=View(5.0, 6.0)).view == View(5.0, 6.0)
+    shot = Shot(film, *SMALL)
+    assert 20 <= abs(shot.view.azimuth) <= 60
+    assert Shot(film, *SMALL, view=View(5.0, 6.0)).view == View(5.0, 6.0)
 
 
 def test_a_frame_for_each_moment_with_a_bar_of_how_far_the_part_is_open(film: Film) -> None:
