@@ -18,15 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.camera.embree import EmbreeScene, triangle_scene
 from fb3d_rl.camera.views import View, look_at, pixel_points, pixel_rays
-from fb3d_rl.contract import UserError
 from fb3d_rl.flow.opening import standing_bounds
-
-try:
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-except ImportError as error:  # no wheel for this platform
-    raise UserError("the raycast camera needs the package embreex; install it with `pip install embreex`") from error
 
 
 @dataclass(frozen=True)
@@ -88,8 +82,7 @@ class RaycastCamera:
         for index, meshes in enumerate(shapes):
             if meshes:
                 triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]).astype(np.float32)
-                self._scenes[index] = EmbreeScene()
-                TriangleMesh(self._scenes[index], triangles)
+                self._scenes[index] = triangle_scene(triangles)
                 extents = zip(triangles.min((0, 1)), triangles.max((0, 1)), strict=True)
                 self._corners[index] = np.array(list(itertools.product(*extents))).T
         bounds = standing_bounds(obj)

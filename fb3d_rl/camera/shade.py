@@ -13,14 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.camera.embree import triangle_scene
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.contract import UserError
-
-try:
-    from embreex.mesh_construction import TriangleMesh
-    from embreex.rtcore_scene import EmbreeScene
-except ImportError as error:  # no wheel for this platform
-    raise UserError("pictures need the package embreex; install it with `pip install embreex`") from error
 
 F32 = NDArray[np.float32]
 Color = tuple[float, float, float]
@@ -124,8 +118,7 @@ class Body:
             low, high = (ends.astype(np.float64) for ends in (self._points.min(0), self._points.max(0)))
             self.centre, self.half = 0.5 * (low + high), 0.5 * (high - low)
             """Centre [3] and half extents [3] (m) of the bounding box in the body's frame."""
-            self._scene = EmbreeScene()
-            TriangleMesh(self._scene, triangles)
+            self._scene = triangle_scene(triangles)
         self.radius = float(np.linalg.norm(self.half))
 
     def outline(self) -> NDArray[np.float64]:

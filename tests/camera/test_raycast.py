@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
+from fb3d_rl.camera.embree import triangle_scene
 from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View
 from fb3d_rl.flow.kinematics import KinematicTree
@@ -311,3 +312,11 @@ def test_pictures_repeat_bit_for_bit(procedural_objects: dict[str, ArticulatedOb
     first, second = (RaycastCamera(obj, options=OPTIONS).capture(poses, View(13.0, 29.0)) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_process_may_have_more_scenes_than_thread_local_keys() -> None:
+    """An Embree device for each scene would end in a crash at about the thousandth."""
+    triangle = np.array([[[0, 0, 1], [1, 0, 1], [0, 1, 1]]], dtype=np.float32)
+    scenes = [triangle_scene(triangle) for _ in range(1500)]
+    hit = scenes[-1].run(np.array([[0.2, 0.2, 0]], dtype=np.float32), np.array([[0, 0, 1]], dtype=np.float32))
+    assert hit.tolist() == [0]
