@@ -108,3 +108,16 @@ def test_contact_stays_on_while_a_part_is_held(env: OpenArticulatedEnv, objects:
         obs, *_ = env.step(velocity(x=0.1))
     assert float(obs["observation"]["contact_force"]) > 100.0
     assert float((obs["observation"]["tool_pose"] - before)[0, 0]) < 0.03
+
+
+def test_the_hand_can_tear_itself_off_across_the_way_of_the_part(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    drawer = links_called(objects["Table"], "drawer")[0]
+    place_before(env, drawer, start(env, objects["Table"], drawer))
+    step_until(env, velocity(x=0.2), lambda: env.suction.attached)
+    for _ in range(3):
+        env.step(velocity(x=-0.8))
+    assert env.suction.attached, "the drawer comes along"
+    torn, _ = step_until(env, velocity(y=2.0), lambda: not env.suction.attached, limit=10)
+    assert torn
