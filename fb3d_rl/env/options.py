@@ -60,7 +60,7 @@ class SuctionOptions:
     damping: float = 3000.0
     angular_damping: float = 1.0
     breaking_force: float = math.inf
-    max_stretch: float = 0.1
+    max_stretch: float = 0.06
     touch: float = 0.002
     reach: float = 0.05
 

@@ -25,8 +25,8 @@ from fb3d_rl.geometry.transforms import (
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.perception.contact import ContactOptions, choose_contact
 
-SELECT, TRAVEL, APPROACH, PULL, RETREAT = range(5)
-"""Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2 and 4, articulation execution (I.G) is 3."""
+SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
+"""Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2, 4 and 5, articulation execution (I.G) is 3."""
 
 TRIES = 6
 """Contact points that are remembered as tried in vain."""
@@ -46,6 +46,8 @@ class FlowPolicyOptions:
         overshoot: how far (m) the tip may pass the contact point before the approach has failed.
         force: contact force (N) that ends an approach which does not hold.
         patience: control steps for which that force is borne, since suction may still engage.
+        stuck_progress: a pull is stuck if the tip moves less (m) along the flow in a control step ...
+        stuck_steps: ... for more control steps than this: the hand tears itself off and tries elsewhere.
         retry_distance: points nearer (m) than this to a point tried in vain are not tried.
         nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
         lead: how far ahead (s) of the observation the flow is read along the part's motion: half a control step, so
@@ -57,7 +59,7 @@ class FlowPolicyOptions:
     """
 
     travel_speed: float = 1.8
-    approach_speed: float = 1.0
+    approach_speed: float = 1.6
     touch_speed: float = 0.3
     pull_speed: float = 0.8
     angular_gain: float = 8.0
@@ -65,6 +67,8 @@ class FlowPolicyOptions:
     overshoot: float = 0.08
     force: float = 20.0
     patience: int = 4
+    stuck_progress: float = 0.004
+    stuck_steps: int = 6
     retry_distance: float = 0.08
     nearby: float = 0.1
     lead: float = 0.025
@@ -98,10 +102,11 @@ class FlowPolicy(TensorDictModuleBase):
     STATE: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
         "phase": ((1,), torch.int64),
         "contact_point": ((3,), torch.float32),
-        "contact_flow": ((3,), torch.float32),
         "standoff": ((3,), torch.float32),
         "pull": ((3,), torch.float32),
-        "pressed": ((1,), torch.int64),
+        "idle": ((1,), torch.int64),
+        "leave": ((3,), torch.float32),
+        "tip": ((3,), torch.float32),
         "tried": ((TRIES, 3), torch.float32),
         "tries": ((1,), torch.int64),
     }
@@ -138,8 +143,9 @@ class FlowPolicy(TensorDictModuleBase):
         pull = self._flow_at(obs, flow, tip, state["pull"])
         # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
         turned = rotation_vector_to_matrix(alignment(state["pull"], pull)) @ state["standoff"][..., None]
-        state["standoff"] = torch.where(phase == PULL, turned.squeeze(-1), state["standoff"])
-        state["pull"] = torch.where(phase == PULL, pull, state["contact_flow"])
+        goes_on = (phase == PULL) & (tensordict["policy", "phase"] == PULL)
+        state["standoff"] = torch.where(goes_on, turned.squeeze(-1), state["standoff"])
+        state["pull"] = torch.where(phase == PULL, pull, state["pull"])
         velocity = torch.where(phase == PULL, o.pull_speed * pull, velocity)
         wanted = self._above_ground(state["standoff"], tip)
         angular = o.angular_gain * alignment(hand, wanted)
@@ -158,31 +164,43 @@ class FlowPolicy(TensorDictModuleBase):
         phase = state["phase"].squeeze(-1)
         attached = obs["attached"].squeeze(-1)
 
-        pressed = obs["contact_force"].squeeze(-1) > o.force
-        count = torch.where(pressed & (phase == APPROACH), state["pressed"].squeeze(-1) + 1, 0)
-        state["pressed"] = count[:, None]
+        pressed = (phase == APPROACH) & (obs["contact_force"].squeeze(-1) > o.force)
+        progress = ((tip - state["tip"]) * state["pull"]).sum(-1)
+        state["tip"] = tip.clone()
+        idle = (phase == PULL) & attached & (progress < o.stuck_progress)
+        count = torch.where(pressed | idle | (phase == RELEASE), state["idle"].squeeze(-1) + 1, 0)
         offset = tip - state["contact_point"]
         height = (offset * state["standoff"]).sum(-1)
         failed = (phase == APPROACH) & ((count > o.patience) | (height < -o.overshoot)) & ~attached
-        lost = (phase == PULL) & ~attached
-        given_up = failed | lost
-        state["contact_point"] = torch.where(lost[:, None], tip, state["contact_point"])
+        stuck = (phase == PULL) & (count > o.stuck_steps)
         slot = (state["tries"] % TRIES)[..., None].expand(-1, 1, 3)
-        remembered = state["tried"].scatter(1, slot, state["contact_point"][:, None])
-        state["tried"] = torch.where(failed[:, None, None], remembered, state["tried"])
-        state["tries"] = state["tries"] + failed[:, None].long()
+        remembered = state["tried"].scatter(1, slot, torch.where(stuck[:, None], tip, state["contact_point"])[:, None])
+        state["tried"] = torch.where((failed | stuck)[:, None, None], remembered, state["tried"])
+        state["tries"] = state["tries"] + (failed | stuck)[:, None].long()
 
-        backed_off = (phase == RETREAT) & (height > o.precontact)
+        lost = ((phase == PULL) | (phase == RELEASE)) & ~attached
+        given_up = failed | lost
+        state["leave"] = torch.where((failed | (lost & (phase == PULL)))[:, None], state["standoff"], state["leave"])
+        state["leave"] = torch.where(stuck[:, None], _across(hand, state["pull"]), state["leave"])
+        state["contact_point"] = torch.where(lost[:, None], tip, state["contact_point"])
+        state["standoff"] = torch.where(lost[:, None], hand, state["standoff"])
+        vain = (phase == RELEASE) & (count > 3 * o.stuck_steps)  # it does not come off: pull on
+
+        backed_off = (phase == RETREAT) & ((offset * state["leave"]).sum(-1) > o.precontact)
         aligned = alignment(hand, state["standoff"]).norm(dim=-1) < 0.15
         on_line = (offset - height[:, None] * state["standoff"]).norm(dim=-1) < 0.04
         ready = (phase == TRAVEL) & aligned & on_line & (height > 0)
         phase = torch.where(ready, APPROACH, phase)
         phase = torch.where(given_up, RETREAT, phase)
         phase = torch.where(backed_off, SELECT, phase)
-        phase = torch.where(attached, PULL, phase)
+        phase = torch.where(stuck, RELEASE, phase)
+        caught = attached & (phase != PULL) & (phase != RELEASE)
+        # Held by chance, from another side than chosen.
+        state["standoff"] = torch.where((caught & (phase != APPROACH))[:, None], hand, state["standoff"])
+        phase = torch.where(caught | vain, PULL, phase)
+        state["idle"] = torch.where(stuck | vain, 0, count)[:, None]
         choosing = phase == SELECT
-        caught = attached & (state["contact_flow"].norm(dim=-1) == 0)  # held before a point was chosen
-        if bool((choosing | caught).any()):
+        if bool(choosing.any()):
             chosen = choose_contact(
                 obs["points"],
                 obs["valid"],
@@ -192,8 +210,8 @@ class FlowPolicy(TensorDictModuleBase):
                 self._avoid(state, obs),
                 o.contact,
             )
-            for key, value in zip(("contact_point", "contact_flow", "standoff"), chosen, strict=True):
-                state[key] = torch.where((choosing | caught)[:, None], value, state[key])
+            for key, value in zip(("contact_point", "pull", "standoff"), chosen, strict=True):
+                state[key] = torch.where(choosing[:, None], value, state[key])
             seen = chosen[1].norm(dim=-1) > 0
             phase = torch.where(choosing & seen, TRAVEL, phase)
         state["phase"] = phase[:, None]
@@ -212,17 +230,22 @@ class FlowPolicy(TensorDictModuleBase):
         height = (offset * standoff).sum(-1, keepdim=True)
         sideways = offset - height * standoff
 
-        approach_speed = torch.where(height > o.precontact, o.approach_speed, o.touch_speed)
+        slowing = (10.0 * (height - o.precontact)).clamp(max=o.approach_speed).clamp_min(o.touch_speed)
+        approach_speed = torch.where(height > o.precontact, slowing, o.touch_speed)
         approach = -approach_speed * standoff - 8.0 * sideways
-        retreat = o.approach_speed * standoff
-        travel = self._travel(obs, tip, contact, standoff)
+        retreat = o.approach_speed * state["leave"]
+        travel = self._travel(state, obs, tip)
         velocity = torch.where(phase == TRAVEL, travel, torch.zeros_like(tip))
         velocity = torch.where(phase == APPROACH, approach, velocity)
-        return torch.where(phase == RETREAT, retreat, velocity)
+        velocity = torch.where(phase == RETREAT, retreat, velocity)
+        return torch.where(phase == RELEASE, self.limits.linear * state["leave"], velocity)
 
-    def _travel(self, obs: TensorDictBase, tip: Tensor, contact: Tensor, standoff: Tensor) -> Tensor:
-        """Velocity [E, 3] around the object's bounding sphere to where the approach line leaves it."""
-        o = self.options
+    def _travel(self, state: TensorDictBase, obs: TensorDictBase, tip: Tensor) -> Tensor:
+        """Velocity [E, 3] around the object's bounding sphere to where the approach line leaves it.
+
+        A hand that comes from another side of the object leaves the sphere first as it backed off before.
+        """
+        o, contact, standoff, leave = self.options, state["contact_point"], state["standoff"], state["leave"]
         valid = obs["valid"][..., None]
         low = torch.where(valid, obs["points"], torch.inf).amin(1)
         high = torch.where(valid, obs["points"], -torch.inf).amax(1)
@@ -245,7 +268,9 @@ class FlowPolicy(TensorDictModuleBase):
         far = (turn.norm(dim=-1, keepdim=True) > 0.35) & (distance > 0.5 * radius)
         step = torch.where(far, normalize(around), normalize(straight))
         speed = torch.where(far, torch.full_like(gap, o.travel_speed), (6.0 * gap).clamp(max=o.travel_speed))
-        return speed * step
+        other_side = (leave * standoff).sum(-1, keepdim=True) < 0.5
+        state["leave"] = torch.where((state["phase"] == TRAVEL) & ((distance > radius) | ~other_side), 0.0, leave)
+        return torch.where(state["leave"].any(-1, keepdim=True), o.travel_speed * leave, speed * step)
 
     def _flow_at(self, obs: TensorDictBase, flow: Tensor, tip: Tensor, last: Tensor) -> Tensor:
         """Unit flow [E, 3] at the held point, ``lead`` ahead; the last one where none is seen.
@@ -292,6 +317,18 @@ class FlowPolicy(TensorDictModuleBase):
         linear = linear / linear.abs().amax(-1, keepdim=True).clamp_min(1.0)
         fingers = torch.zeros(*rates.shape[:-1], ACTION_DIM - 6, dtype=rates.dtype, device=rates.device)
         return torch.cat([linear, rates / self.limits.angular, fingers], dim=-1)
+
+
+def _across(hand: Tensor, pull: Tensor) -> Tensor:
+    """Unit directions [E, 3] across ``pull`` in which the hand backs off; level ones where it comes along ``pull``.
+
+    Across the flow the part cannot follow, so that the suction breaks; along it the part would only be moved on.
+    """
+    up = torch.zeros_like(pull)
+    up[..., 2] = 1.0
+    level = torch.linalg.cross(pull, up)
+    away = hand - (hand * pull).sum(-1, keepdim=True) * pull
+    return normalize(torch.where(away.norm(dim=-1, keepdim=True) > 0.3, away, level))
 
 
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:

@@ -136,3 +136,16 @@ def test_impulses_tell_touch_and_force_like_points(
     finally:
         del env._after_simulation_step
     assert held and seen and stage.suction.held in seen[0]
+
+
+def test_the_hand_can_tear_itself_off_across_the_way_of_the_part(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    drawer = links_called(objects["Table"], "drawer")[0]
+    place_before(env, drawer, start(env, objects["Table"], drawer))
+    step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
+    for _ in range(3):
+        env.step(velocity(x=-0.8))
+    assert env.stages[0].suction.attached, "the drawer comes along"
+    torn, _ = step_until(env, velocity(y=2.0), lambda: not env.stages[0].suction.attached, limit=10)
+    assert torn

@@ -16,8 +16,10 @@ from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.flow_policy import (
     APPROACH,
     PULL,
+    RELEASE,
     RETREAT,
     SELECT,
+    TRAVEL,
     FlowPolicy,
     FlowPolicyOptions,
     VelocityLimits,
@@ -243,3 +245,47 @@ def test_a_hand_that_lost_hold_backs_off_from_there() -> None:
             backing = step
     assert backing - lost < 8, "10 cm at 1 m/s, wherever the first contact was"
     assert PULL in phases[backing:]
+
+
+def test_a_stuck_hand_tears_itself_off_across_the_flow_and_tries_elsewhere() -> None:
+    options = FlowPolicyOptions()
+    policy, door = expert_policy(LIMITS, options), ToyDoor(sliding=True)
+    state, phases, touched = policy.initial_state((1,)), [], []
+    for _ in range(150):
+        td = policy(door.observe(state))
+        state = td["next", "policy"]
+        phases.append(int(state["phase"]))
+        first = len(touched) < 2
+        if phases[-1] == RELEASE:
+            velocity = policy_velocity(td["action"])
+            assert abs(float(velocity[0])) < 0.1 and float(velocity.norm()) > 1.0, "the drawer can only move along x"
+        blocked = door.opened > 0.2 and door.held is not None and first
+        before = door.qpos.clone()
+        door.step(td["action"])
+        if phases[-1] not in (APPROACH, PULL):
+            door.held = None
+        if door.held is not None and (not touched or touched[-1] != int(door.held)):
+            touched.append(int(door.held))
+        if blocked:
+            door.qpos = before
+    assert RELEASE in phases
+    assert phases.count(PULL) > options.stuck_steps
+    assert len(touched) == 2 and (door.grid[touched[0]] - door.grid[touched[1]]).norm() > 0.5 * options.retry_distance
+    assert door.opened > 0.5
+
+
+def policy_velocity(action: Tensor) -> Tensor:
+    """The commanded velocity [3] of the hand's origin, m/s."""
+    return action[0, :3] * LIMITS.linear
+
+
+def test_a_hand_that_is_held_by_chance_keeps_its_direction() -> None:
+    policy, door = expert_policy(LIMITS), ToyDoor()
+    state = policy(door.observe(policy.initial_state((1,))))["next", "policy"]
+    assert int(state["phase"]) == TRAVEL
+    door.qpos[:, 5] = 0.8  # turned about z on its way
+    door.held = torch.tensor(0)
+    state = policy(door.observe(state))["next", "policy"]
+    hand = -euler_xyz_to_matrix(door.qpos[:, 3:6])[..., 0]
+    assert int(state["phase"]) == PULL
+    assert torch.allclose(state["standoff"], hand, atol=1e-5)
