@@ -162,6 +162,19 @@ class PolicyConfig:
 
 
 @dataclass
+class CollectorConfig:
+    """fb3d_rl.env.workers.CollectorOptions.
+
+    Attributes:
+        workers: null for one per core.
+    """
+
+    backend: str
+    workers: int | None
+    restarts: int
+
+
+@dataclass
 class EvaluationConfig:
     """Which trials.
 
@@ -188,6 +201,7 @@ class CommandConfig:
     camera: CameraConfig
     env: EnvConfig
     policy: PolicyConfig
+    collector: CollectorConfig
     evaluation: EvaluationConfig
     seed: int
     device: str
@@ -216,6 +230,9 @@ def validate(cfg: CommandConfig) -> None:
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
     _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+    _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
+    _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
+    _at_least("collector.restarts", cfg.collector.restarts, 0)
     _one_of("env.suction.hold", cfg.env.suction.hold, ("target", "any"))
     _one_of("camera.kind", cfg.camera.kind, ("raycast", "sapien"))
     _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))

@@ -23,6 +23,7 @@ from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
+from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.perception.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 
@@ -93,6 +94,8 @@ def test_every_experiment_changes_something_and_is_valid(experiment: str) -> Non
 
 def test_what_the_command_line_says_goes_before_an_experiment() -> None:
     assert compose("train", "experiment=smoke", "data.train_samples=7").data.train_samples == 7
+    assert compose("evaluate", "experiment=smoke").collector.backend == "direct"
+    assert compose("evaluate", "experiment=smoke", "collector=process").collector.backend == "process"
 
 
 def sources() -> str:
@@ -122,7 +125,7 @@ def test_the_run_follows_from_the_configuration() -> None:
     cfg = compose("train", "data.points=321", "camera.fov=50", "env.gripper.v_max=0.7", "env.suction.max_stretch=0.2",
                   "policy.contact.min_distance=0.03", "policy.flow.pull_speed=0.6",
                   "algo.epochs=2", "algo.batch_size=8", "data.train_samples=21",
-                  "seed=3",
+                  "seed=3", "collector.workers=3", "collector.restarts=4",
                   "evaluation.trials=null", "camera.azimuth=[1,2]", "env.gravity=true")  # fmt: skip
     samples, env, speeds, fit = (
         setup.sample_options(cfg), setup.env_options(cfg), setup.flow_policy_options(cfg), fit_options(cfg)
@@ -131,6 +134,7 @@ def test_the_run_follows_from_the_configuration() -> None:
     assert tuple(samples.views.azimuth) == (1.0, 2.0) and env.gravity
     assert env.gripper.v_max == setup.velocity_limits(cfg).linear == 0.7 and env.suction.max_stretch == 0.2
     assert speeds.contact.min_distance == 0.03 and speeds.pull_speed == 0.6
+    assert setup.protocol(cfg).collector == CollectorOptions("process", 3, 4)
     assert (fit.steps, fit.batch_size, fit.seed) == (6, 8, 3) and setup.protocol(cfg).trials is None
 
 
@@ -142,6 +146,7 @@ PAIRS: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "policy/flow:contact": ((ContactOptions(),), ("contact",)),
     "camera/raycast": ((CameraOptions(), ViewRange()), ()),
     "data/default": ((SampleOptions(),), ()),
+    "collector/direct": ((CollectorOptions(),), ()),
 }
 ONLY_CONFIGURED = {"data/default": {"train_samples", "eval_samples", "workers"}}
 
@@ -183,6 +188,9 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("camera.resolution=0", "camera.resolution"),
         ("camera.kind=lidar", "camera.kind"),
         ("camera.shader=rt", "camera.shader"),
+        ("collector.backend=rpc", "collector.backend"),
+        ("collector.workers=0", "collector.workers"),
+        ("collector.restarts=-1", "collector.restarts"),
         ("evaluation.trials=-1", "evaluation.trials"),
         ("env.suction.hold=all", "env.suction.hold"),
         ("policy=expert", "policy.name"),

@@ -19,6 +19,7 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
+from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.video import require_encoder
 from fb3d_rl.perception.contact import ContactOptions
@@ -113,6 +114,7 @@ def protocol(cfg: CommandConfig) -> Protocol:
     return Protocol(
         samples=sample_options(cfg),
         env=env_options(cfg),
+        collector=collector_options(cfg),
         trials=cfg.evaluation.trials,
         samples_per_object=cfg.data.eval_samples,
         clouds=cfg.evaluation.clouds,
@@ -130,6 +132,12 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and not torch.cuda.is_available():
         raise UserError("device=cuda, but torch finds no CUDA device; use device=auto or device=cpu")
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+def collector_options(cfg: CommandConfig) -> CollectorOptions:
+    """Where trials run."""
+    collector: Any = cfg.collector
+    return CollectorOptions(collector.backend, workers(collector.workers), collector.restarts)
 
 
 def workers(count: int | None) -> int:

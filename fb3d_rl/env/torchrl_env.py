@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import itertools
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
+from gymnasium.spaces import Box
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, TensorSpec, Unbounded
@@ -17,73 +20,58 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial
 
 if TYPE_CHECKING:
+    import gymnasium
     from mani_skill.envs.sapien_env import BaseEnv
-
-METRICS = (*contract.spec("metrics"), "success")
-"""Entries of ManiSkill's ``info`` that become entries of the TensorDict."""
 
 
 class ManiSkillEnv(EnvBase):
-    """Wraps a ManiSkill environment whose observations are nested dicts of tensors [E, ...].
+    """Wraps any ManiSkill environment, batched over its E parallel scenes.
 
-    A step's TensorDict holds under "next" the observation, the metrics of ``info`` ([E, 1] each), "reward" and "done"
-    = "terminated" or "truncated"; "trial" [E, 1] is the number of the running trial in the list given to
-    :meth:`set_trials`, -1 without one. The specs are those of the first observation, which is checked against the
-    data contract (an environment without points only for its metrics).
+    A step's TensorDict holds under "next" the observation, whatever tensors [E, ...] the environment's ``info`` has
+    ("success", "fail", "elapsed_steps" ...), "reward" [E, 1] and "done" = "terminated" or "truncated" [E, 1]. A dict
+    of observations keeps its keys, a flat one becomes "observation"; an entry with one number per scene has shape
+    [E, 1]. The specs are those of the first reset. A "_reset" mask [E, 1] resets the marked scenes only.
 
     Args:
-        env: the environment; ``batch_size`` is ``[env.num_envs]``.
+        env: what ``gymnasium.make`` of a ManiSkill task returns, or the task itself; its action space is a box.
 
     Raises:
-        ValueError: an observation does not keep the contract.
+        ValueError: the action space is no box.
     """
 
-    def __init__(self, env: BaseEnv) -> None:
-        super().__init__(device=env.device, batch_size=[env.num_envs])
+    env: gymnasium.Env[Any, Any]
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        task: Any = env.unwrapped
+        super().__init__(device=task.device, batch_size=[task.num_envs])
         self.env = env
-        self._trials: Sequence[Trial] = ()
-        self._started = 0
         self._seed: int | None = None
+        space = task.single_action_space
+        if not isinstance(space, Box):
+            raise ValueError(f"the action space {space} is no box")
+        self.action_spec = _action_spec(space, self.batch_size, self.device)
         obs, info = env.reset()
-        first = self._read(obs, info)
-        sees = ("observation", "points") in first.keys(include_nested=True)
-        for group in ("observation", "privileged", "metrics") if sees else ("metrics",):
-            contract.check(first, group)
-        self.observation_spec = _specs_of(first)
-        (width,) = contract.spec("action")["action"].shape
-        if env.single_action_space.shape != (width,):
-            raise ValueError(f"action has shape {env.single_action_space.shape}, the contract says {(width,)}")
-        self.action_spec = Bounded(-1.0, 1.0, shape=(*self.batch_size, int(width)), device=self.device)
+        self._info_keys = [key for key in info if self._per_scene(info[key])]
+        self.observation_spec = _specs_of(self._read(obs, info))
         self.reward_spec = Unbounded(shape=(*self.batch_size, 1), device=self.device)
         flag = Categorical(2, dtype=torch.bool, shape=(*self.batch_size, 1), device=self.device)
         self.done_spec = Composite(
             {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=self.batch_size
         )
 
-    def set_trials(self, trials: Iterable[Trial]) -> None:
-        """Let each further reset start the next of ``trials``; after the last one comes the first again.
-
-        Raises:
-            UserError: there is no trial.
-        """
-        trials = tuple(trials)
-        if not trials:
-            raise UserError("the list of trials is empty; give at least one")
-        self._trials, self._started = trials, 0
-
-    @property
-    def running_trial(self) -> int:
-        """Number of the running trial in the list given to :meth:`set_trials`; -1 without one."""
-        return (self._started - 1) % len(self._trials) if self._trials and self._started else -1
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        options: dict[str, Any] = {}
+        return self._start(self._scenes_to_reset(tensordict), {})
+
+    def _scenes_to_reset(self, tensordict: TensorDictBase | None) -> Tensor:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is not None and not mask.all():
-            options["env_idx"] = mask.flatten().nonzero().flatten()
-        if self._trials:
-            options["trials"] = [self._trials[self._started % len(self._trials)]]
-            self._started += 1
+        if mask is None:
+            return torch.arange(self.batch_size[0], device=self.device)
+        return mask.flatten().nonzero().flatten()
+
+    def _start(self, scenes: Tensor, options: dict[str, Any]) -> TensorDictBase:
+        """Reset ``scenes`` [k]; the result covers all E."""
+        if len(scenes) < self.batch_size[0]:
+            options = options | {"env_idx": scenes}
         obs, info = self.env.reset(seed=self._seed, options=options)
         self._seed = None
         return self._read(obs, info)
@@ -91,9 +79,10 @@ class ManiSkillEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         obs, reward, terminated, truncated, info = self.env.step(tensordict["action"])
         result = self._read(obs, info)
-        result["reward"] = self._column(reward).float()
-        result["terminated"] = self._column(terminated)
-        result["truncated"] = self._column(truncated)
+        shape = (*self.batch_size, 1)
+        result["reward"] = torch.as_tensor(reward).reshape(shape).float()
+        result["terminated"] = torch.as_tensor(terminated).reshape(shape)
+        result["truncated"] = torch.as_tensor(truncated).reshape(shape)
         result["done"] = result["terminated"] | result["truncated"]
         return result
 
@@ -105,16 +94,82 @@ class ManiSkillEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
         self.env.close()
 
-    def _read(self, obs: dict[str, Any], info: dict[str, Any]) -> TensorDict:
-        result = TensorDict(obs, batch_size=self.batch_size, device=self.device)
-        for key in METRICS:
-            if key in info:
-                result[key] = self._column(info[key])
-        result["trial"] = torch.full((*self.batch_size, 1), self.running_trial, dtype=torch.int64, device=self.device)
+    def _per_scene(self, value: Any) -> bool:
+        return isinstance(value, Tensor) and value.shape[:1] == self.batch_size
+
+    def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
+        content = dict(obs) if isinstance(obs, dict) else {"observation": obs}
+        content |= {key: info[key] for key in self._info_keys}
+        return TensorDict(_copied(content), batch_size=self.batch_size, device=self.device)
+
+
+def _copied(content: dict[str, Any]) -> dict[str, Any]:
+    """Copies of all entries, since ManiSkill hands out buffers of its own, of at least two dimensions each.
+
+    Groups without an entry, which TorchRL refuses, are left out.
+    """
+    copied: dict[str, Any] = {}
+    for key, value in content.items():
+        if not isinstance(value, dict):
+            copied[key] = (value[:, None] if value.ndim == 1 else value).clone()
+        elif group := _copied(value):
+            copied[key] = group
+    return copied
+
+
+class TrialEnv(ManiSkillEnv):
+    """The task of this package, whose resets start one given trial after the other.
+
+    "trial" [E, 1] is the number of the running trial in what was given to :meth:`set_trials`, -1 if none runs.
+
+    Args:
+        env: the task.
+    """
+
+    def __init__(self, env: BaseEnv) -> None:
+        self._trials: Iterator[tuple[int, Trial]] | None = None
+        self._running = [-1] * env.num_envs
+        super().__init__(env)
+
+    def set_trials(self, trials: Iterable[Trial]) -> None:
+        """Let each further reset start the next of ``trials``.
+
+        Once they have run out, a reset leaves the scene as it is: it costs nothing, and what follows is no trial. Give
+        ``itertools.cycle(trials)`` to start over. Without any call of this method the task draws its trials.
+        """
+        self._trials = enumerate(trials)
+
+    @property
+    def idle(self) -> bool:
+        """Whether the trials have run out and none is running."""
+        return self._trials is not None and max(self._running) < 0
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        scenes = self._scenes_to_reset(tensordict)
+        if self._trials is None:
+            return self._start(scenes, {})
+        given = list(itertools.islice(self._trials, len(scenes)))
+        for scene, number in itertools.zip_longest(scenes.tolist(), (number for number, _ in given), fillvalue=-1):
+            self._running[scene] = number
+        if not given:
+            return self._read(*self._seen)
+        return self._start(scenes[: len(given)], {"trials": [trial for _, trial in given]})
+
+    def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
+        self._seen = obs, info
+        result = super()._read(obs, info)
+        result["trial"] = torch.tensor(self._running, device=self.device)[:, None]
         return result
 
-    def _column(self, values: Tensor) -> Tensor:
-        return values.reshape(*self.batch_size, 1)
+
+def _action_spec(space: Box, batch: torch.Size, device: torch.device) -> TensorSpec:
+    """Actions [E, A] within the box; unbounded ones where a bound is infinite."""
+    shape = (*batch, *space.shape)
+    dtype = torch.as_tensor(space.low).dtype
+    if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
+        return Unbounded(shape=shape, dtype=dtype, device=device)
+    low, high = (torch.as_tensor(bound, device=device).expand(shape) for bound in (space.low, space.high))
+    return Bounded(low, high, shape=shape, dtype=dtype, device=device)
 
 
 def _specs_of(sample: TensorDictBase) -> Composite:
@@ -150,21 +205,27 @@ def make_env(
     options: EnvOptions | None = None,
     trials: Iterable[Trial] | None = None,
     **kwargs: Any,
-) -> ManiSkillEnv:
+) -> TrialEnv:
     """Make the task for ``objects``, ready for TorchRL's collectors.
 
     Args:
         objects: the objects that trials may name.
         options: the task's constants.
-        trials: see :meth:`ManiSkillEnv.set_trials`; without them every reset runs the first object's default trial.
+        trials: see :meth:`TrialEnv.set_trials`; without them the task draws its own.
         kwargs: for :class:`fb3d_rl.env.task.OpenArticulatedEnv`, such as ``obs_mode`` or ``reward_mode``.
 
     Raises:
-        UserError: there is no object, or the first one has nothing to open.
+        UserError: there is no object, or none has something to open.
+        ValueError: the task does not keep the data contract (one without points only has to have the metrics).
     """
     from fb3d_rl.env.task import OpenArticulatedEnv
 
-    env = ManiSkillEnv(OpenArticulatedEnv(objects, options, **kwargs))
+    env = TrialEnv(OpenArticulatedEnv(objects, options, **kwargs))
+    first = env.observation_spec.zero()
+    sees = ("observation", "points") in first.keys(include_nested=True)
+    for group in ("observation", "privileged", "metrics") if sees else ("metrics",):
+        contract.check(first, group)
+    contract.check(env.full_action_spec.zero(), "action")
     if trials is not None:
         env.set_trials(trials)
     return env

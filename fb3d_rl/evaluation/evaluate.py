@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModuleBase
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
 from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import write_report
@@ -37,6 +38,7 @@ class Protocol:
     Attributes:
         samples: clouds, views and camera of trials and flow samples.
         env: the task's constants.
+        collector: where trials run.
         trials: at most this many trials, None for all, 0 for none.
         samples_per_object: flow samples of each object and target.
         clouds: clouds kept for the report.
@@ -46,6 +48,7 @@ class Protocol:
 
     samples: SampleOptions
     env: EnvOptions
+    collector: CollectorOptions
     trials: int | None
     samples_per_object: int
     clouds: int
@@ -92,7 +95,8 @@ def evaluate(
     with _progress() as bar:
         for name, policy in policies.items() if scheduled else ():
             task = bar.add_task(f"trials: {name}", total=len(scheduled))
-            rows += run_trials(name, policy, shown, scheduled, protocol.env, partial(_advance, bar, task))
+            advance = partial(_advance, bar, task)
+            rows += run_trials(name, policy, shown, scheduled, protocol.env, advance, protocol.collector)
             write_trials(out / "rows.csv", rows)
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from fb3d_rl.camera.views import View
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.evaluation.rollout import policy_env
+
+if TYPE_CHECKING:
+    from fb3d_rl.env.task import OpenArticulatedEnv
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +78,7 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
         options: the task's constants.
     """
     base = make_env([obj], options, [trial])
-    env = policy_env(base)
+    env, task = policy_env(base), cast("OpenArticulatedEnv", base.env)
     poses, frames = [], []
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
@@ -83,14 +86,14 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
             while True:
                 # After the last step the policy is asked once more, for what it predicts there.
                 frame = policy(frame)
-                poses.append(base.env.stages[0].poses())
+                poses.append(task.stages[0].poses())
                 frames.append(frame[0].clone())
                 if done:
                     break
                 frame = env.step(frame)
                 done = bool(frame["next", "done"])
                 frame = step_mdp(frame)
-        gripper = base.env.stages[0].model.gripper
+        gripper = task.stages[0].model.gripper
     finally:
         env.close(raise_if_closed=False)
     predicted = ("prediction", "flow") in frames[0].keys(include_nested=True)

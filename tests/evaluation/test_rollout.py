@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +18,8 @@ from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.env.torchrl_env import make_env
+from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.policies.flow_policy import VelocityLimits, expert_policy
@@ -86,3 +90,34 @@ def test_a_crash_costs_its_own_trial_only(objects: list[ArticulatedObject], tria
     assert len(rows) == len(trials)
     assert [row.status for row in rows] == ["ok", "error", *["ok"] * (len(trials) - 2)]
     assert "the network fell over" in rows[1].error and rows[1].normalized_distance == 1.0
+
+
+class Deadly(TensorDictModuleBase):
+    """The expert, until its fifth step seen from ``camera``, which kills the process."""
+
+    def __init__(self, camera: torch.Tensor) -> None:
+        super().__init__()
+        self.expert = expert_policy(LIMITS)
+        self.in_keys, self.out_keys = self.expert.in_keys, self.expert.out_keys
+        self.camera = camera
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        if td["elapsed_steps"].item() == 4 and torch.equal(td["observation", "camera_position"], self.camera):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.expert(td)
+
+
+@pytest.mark.slow
+def test_worker_processes_give_the_same_rows_and_a_dead_one_costs_its_trial_only(
+    objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    rows = run_trials("expert", expert_policy(LIMITS), objects, trials, OPTIONS)
+    env = make_env(objects, OPTIONS, [trials[1].trial])
+    policy = Deadly(env.reset()["observation", "camera_position"])
+    env.close()
+    seen: list[int] = []
+    again = run_trials("expert", policy, objects, trials, OPTIONS, lambda row: seen.append(row.trial),
+                       CollectorOptions("process", 2))  # fmt: skip
+    assert sorted(seen) == list(range(len(trials)))
+    assert again[1].status == "error" and "signal 9" in again[1].error and again[1].failure == "crashed"
+    assert again[:1] + again[2:] == rows[:1] + rows[2:]
