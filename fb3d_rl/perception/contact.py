@@ -78,6 +78,11 @@ def choose_contact(
     """
     norm = flow.norm(dim=-1)
     largest = norm.amax(-1, keepdim=True)
+    cloud, seen, obstacle = points, valid, valid & ~part
+    moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen
+    if not len(moving):
+        return torch.zeros_like(camera), torch.zeros_like(camera), torch.zeros_like(camera)
+    points, valid, part, flow, avoid, norm = (x[:, moving] for x in (points, valid, part, flow, avoid, norm))
     weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
     movable = weak & (norm >= options.min_flow * largest)
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
@@ -88,9 +93,9 @@ def choose_contact(
     usual = torch.where(along >= options.facing, direction, normals)
     usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
 
-    squared = squared_distances(points, points)
+    squared = squared_distances(points, cloud)
     ways = torch.stack([usual, normals, sight], dim=2)
-    free = torch.stack([~_blocked(points, squared, valid, way, options) for way in ways.unbind(2)], dim=-1)
+    free = torch.stack([~_blocked(points, cloud, squared, seen, way, options) for way in ways.unbind(2)], dim=-1)
     first = free.int().argmax(-1)  # the first free way; the usual one where none is
     standoff = ways.gather(2, first[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
 
@@ -100,7 +105,7 @@ def choose_contact(
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
     reachable = weak & smooth & fresh & free.any(-1)
-    clear = _clear(points, valid & ~part, part & valid, flow, standoff, reachable, distance, options)
+    clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
 
     tiers = [
         movable & smooth & free[..., 0] & fresh & clear,
@@ -133,9 +138,14 @@ def _rim(points: Tensor, on_part: Tensor, options: ContactOptions) -> Tensor:
     return (mean - points).norm(dim=-1) > options.rim * spread
 
 
-def _blocked(points: Tensor, squared: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
-    """Whether other points, or the ground, are in the cylinder that the hand needs before each point, [B, N] bool."""
-    ahead = standoff @ points.mT - (standoff * points).sum(-1, keepdim=True)  # [B, N, N]: of point j before point i
+def _blocked(
+    points: Tensor, cloud: Tensor, squared: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions
+) -> Tensor:
+    """Whether the cloud, or the ground, is in the cylinder that the hand needs before each point, [B, M] bool.
+
+    ``squared`` [B, M, N] are the squared distances from the M points to the N of the cloud.
+    """
+    ahead = standoff @ cloud.mT - (standoff * points).sum(-1, keepdim=True)  # [B, M, N]
     aside = squared - ahead.square()
     inside = (ahead > options.clearance) & (ahead < options.reach) & (aside < options.hand_radius**2) & valid[:, None]
     return (inside.sum(-1) > 1) | _underground(points, standoff, options)
@@ -148,19 +158,20 @@ def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> T
 
 def _clear(
     points: Tensor,
-    obstacle: Tensor,
     part: Tensor,
     flow: Tensor,
+    cloud: Tensor,
+    obstacle: Tensor,
     standoff: Tensor,
     wanted: Tensor,
     distance: Tensor,
     options: ContactOptions,
 ) -> Tensor:
-    """Which points the hand can hold all along their way with the part, [B, N] bool.
+    """Which points the hand can hold all along their way with the part, [B, M] bool.
 
-    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet a point of
-    ``obstacle`` or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the smallest to
-    the largest ``distance``; the others count as not clear.
+    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet the cloud's
+    points of ``obstacle`` or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the
+    smallest to the largest ``distance``; the others count as not clear.
     """
     count = min(options.candidates, points.shape[1])
     order = torch.where(wanted, distance, torch.inf).argsort(-1)
@@ -178,7 +189,7 @@ def _clear(
         turn, shift = screw(velocity[:, None], omega[:, None], time * step / options.sweep_steps)
         at = (turn @ (contact - centre[:, None])[..., None]).squeeze(-1) + shift + centre[:, None]
         hand = at[:, :, None] + reach[:, None] * (turn @ away[..., None]).squeeze(-1)[:, :, None]  # [B, K, 3, 3]
-        gap = torch.cdist(hand.flatten(1, 2), points).masked_fill(~obstacle[:, None], torch.inf).amin(-1)
+        gap = torch.cdist(hand.flatten(1, 2), cloud).masked_fill(~obstacle[:, None], torch.inf).amin(-1)
         clear &= (gap.view_as(hand[..., 0]) > options.hand_radius).all(-1) & (hand[..., 2] > 0).all(-1)
     result = torch.zeros_like(wanted).scatter(1, index, clear)
     return result & wanted

@@ -140,7 +140,8 @@ class FlowPolicy(TensorDictModuleBase):
         self._advance(state, obs, flow, tip, hand)
         phase = state["phase"]
         velocity = self._path_velocity(state, obs, tip)
-        pull = self._flow_at(obs, flow, tip, state["pull"])
+        pulling = bool((phase == PULL).any())
+        pull = self._flow_at(obs, flow, tip, state["pull"]) if pulling else state["pull"]
         # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
         turned = rotation_vector_to_matrix(alignment(state["pull"], pull)) @ state["standoff"][..., None]
         goes_on = (phase == PULL) & (tensordict["policy", "phase"] == PULL)
@@ -234,7 +235,7 @@ class FlowPolicy(TensorDictModuleBase):
         approach_speed = torch.where(height > o.precontact, slowing, o.touch_speed)
         approach = -approach_speed * standoff - 8.0 * sideways
         retreat = o.approach_speed * state["leave"]
-        travel = self._travel(state, obs, tip)
+        travel = self._travel(state, obs, tip) if bool((phase == TRAVEL).any()) else torch.zeros_like(tip)
         velocity = torch.where(phase == TRAVEL, travel, torch.zeros_like(tip))
         velocity = torch.where(phase == APPROACH, approach, velocity)
         velocity = torch.where(phase == RETREAT, retreat, velocity)
