@@ -78,7 +78,7 @@ class FloatingSuctionGripper(BaseAgent):
     def tool_pose(self) -> Tensor:
         """Pose [E, 7] of the suction tip in the world: p (m) and q (wxyz, w >= 0)."""
         poses = [body.entity_pose for body in self.robot.links_map[TOOL]._objs]
-        rows = np.array([[*pose.p, *pose.q] for pose in poses], dtype=np.float32)
+        rows = np.array([np.concatenate([pose.p, pose.q]) for pose in poses], dtype=np.float32)
         rows[rows[:, 3] < 0, 3:] *= -1.0
         return torch.from_numpy(rows).to(self.device)
 

@@ -380,14 +380,18 @@ class OpenArticulatedEnv(BaseEnv):
 
     def evaluate(self) -> dict[str, Tensor]:
         """Metrics: normalized_distance [E, 1], contact [E, 1] (suction has held the part) and success [E]."""
-        position = self.joint_positions().gather(1, self._target)
+        self._position = self.joint_positions().gather(1, self._target)
         # Signed, so that a part pushed past its limit by the solver's slack counts as open.
-        distance = ((self._goal - position) / (self._goal - self._start)).clamp_min(0.0)
+        distance = ((self._goal - self._position) / (self._goal - self._start)).clamp_min(0.0)
         return {
             "normalized_distance": distance,
             "contact": self._contact.clone(),
             "success": (distance < self.options.success)[:, 0],
         }
+
+    def get_info(self) -> dict[str, Any]:
+        """ManiSkill's, with a count of steps that does not go on counting."""
+        return super().get_info() | {"elapsed_steps": self._elapsed_steps.clone()}
 
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Any]) -> Tensor:
         """How far the part is open [E]: 0 at the start, 1 at the goal."""
@@ -403,13 +407,15 @@ class OpenArticulatedEnv(BaseEnv):
         """Observation and privileged truth, by the data contract's keys, each batched over E."""
         if self._obs_mode == "none":
             return {}
+        if info is None:
+            self.evaluate()
         robot = self.agent.robot
         poses = [stage.poses() for stage in self.stages]
         truth = self._tensor([_joint_truth(s, p) for s, p in zip(self.stages, poses, strict=True)])
         obs: dict[str, dict[str, Tensor]] = {
             "observation": {
-                "qpos": robot.get_qpos().clone(),
-                "qvel": robot.get_qvel().clone(),
+                "qpos": robot.get_qpos(),
+                "qvel": robot.get_qvel(),
                 "tool_pose": self.agent.tool_pose(),
                 "attached": self._tensor([[stage.suction.attached] for stage in self.stages]),
                 "contact_force": self._force.clone(),
@@ -419,7 +425,7 @@ class OpenArticulatedEnv(BaseEnv):
                 "joint_axis": truth[:, :3],
                 "joint_origin": truth[:, 3:],
                 "joint_prismatic": self._prismatic.clone(),
-                "joint_position": self.joint_positions().gather(1, self._target),
+                "joint_position": self._position,
             },
         }
         if self._obs_mode == "rgbd" or (self._obs_mode == "pointcloud" and self.options.camera.kind == "sapien"):

@@ -100,21 +100,22 @@ class ManiSkillEnv(EnvBase):
     def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
         content = dict(obs) if isinstance(obs, dict) else {"observation": obs}
         content |= {key: info[key] for key in self._info_keys}
-        return TensorDict(_copied(content), batch_size=self.batch_size, device=self.device)
+        return TensorDict(self._entries(content), batch_size=self.batch_size, device=self.device)
 
+    def _entries(self, content: dict[str, Any]) -> dict[str, Any]:
+        """Entries of at least two dimensions each; groups without an entry, which TorchRL refuses, are left out."""
+        entries: dict[str, Any] = {}
+        for key, value in content.items():
+            if isinstance(value, dict):
+                if group := self._entries(value):
+                    entries[key] = group
+            else:
+                entries[key] = self._entry(value)
+        return entries
 
-def _copied(content: dict[str, Any]) -> dict[str, Any]:
-    """Copies of all entries, since ManiSkill hands out buffers of its own, of at least two dimensions each.
-
-    Groups without an entry, which TorchRL refuses, are left out.
-    """
-    copied: dict[str, Any] = {}
-    for key, value in content.items():
-        if not isinstance(value, dict):
-            copied[key] = (value[:, None] if value.ndim == 1 else value).clone()
-        elif group := _copied(value):
-            copied[key] = group
-    return copied
+    def _entry(self, value: Tensor) -> Tensor:
+        # A copy, since ManiSkill hands out buffers of its own.
+        return (value[:, None] if value.ndim == 1 else value).clone()
 
 
 class TrialEnv(ManiSkillEnv):
@@ -154,6 +155,9 @@ class TrialEnv(ManiSkillEnv):
         if not given:
             return self._read(*self._seen)
         return self._start(scenes[: len(given)], {"trials": [trial for _, trial in given]})
+
+    def _entry(self, value: Tensor) -> Tensor:
+        return value[:, None] if value.ndim == 1 else value  # this task hands out no buffers
 
     def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
         self._seen = obs, info
