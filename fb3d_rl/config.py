@@ -96,22 +96,31 @@ class AlgoConfig:
 
 @dataclass
 class GripperConfig:
-    """Part of fb3d_rl.env.options.GripperOptions."""
+    """fb3d_rl.env.options.GripperOptions."""
 
     v_max: float
     w_max: float
+    f_max: float
     force_limit: float
+    torque_limit: float
+    finger_force_limit: float
+    damping: float
+    angular_damping: float
+    distance: float
 
 
 @dataclass
 class SuctionConfig:
-    """Part of fb3d_rl.env.options.SuctionOptions."""
+    """fb3d_rl.env.options.SuctionOptions."""
 
     hold: str
     stiffness: float
     damping: float
+    angular_damping: float
     breaking_force: float
     max_stretch: float
+    touch: float
+    reach: float
 
 
 @dataclass

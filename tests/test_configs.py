@@ -131,7 +131,7 @@ def test_the_run_follows_from_the_configuration() -> None:
         setup.sample_options(cfg), setup.env_options(cfg), setup.flow_policy_options(cfg), fit_options(cfg)
     )  # fmt: skip
     assert samples.points == env.points == 321 and samples.camera == env.camera and env.camera.fov == 50
-    assert tuple(samples.views.azimuth) == (1.0, 2.0) and env.gravity
+    assert tuple(samples.views.azimuth) == (1.0, 2.0) and env.views == samples.views and env.gravity
     assert env.gripper.v_max == setup.velocity_limits(cfg).linear == 0.7 and env.suction.max_stretch == 0.2
     assert speeds.contact.min_distance == 0.03 and speeds.pull_speed == 0.6
     assert setup.protocol(cfg).collector == CollectorOptions("process", 3, 4)

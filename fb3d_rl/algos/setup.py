@@ -57,12 +57,18 @@ def camera_options(cfg: CommandConfig) -> CameraOptions:
     return CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
 
 
+def view_range(cfg: CommandConfig) -> ViewRange:
+    """Where the camera may stand."""
+    (left, right), (low, high) = cfg.camera.azimuth, cfg.camera.elevation
+    return ViewRange((left, right), (low, high))
+
+
 def sample_options(cfg: CommandConfig) -> SampleOptions:
     """How clouds are taken."""
-    camera, data = cfg.camera, cfg.data
+    data = cfg.data
     return SampleOptions(
         points=data.points,
-        views=ViewRange((camera.azimuth[0], camera.azimuth[1]), (camera.elevation[0], camera.elevation[1])),
+        views=view_range(cfg),
         camera=camera_options(cfg),
         closed_share=data.closed_share,
         others_closed=data.others_closed,
@@ -77,6 +83,7 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
     return EnvOptions(
         gripper=GripperOptions(**asdict(env.gripper)),
         suction=SuctionOptions(**asdict(env.suction)),
+        views=view_range(cfg),
         points=cfg.data.points,
         horizon=env.horizon,
         success=env.success,
