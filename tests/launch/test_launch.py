@@ -84,3 +84,12 @@ def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> No
     assert "pathlib" in imported
     assert not imported & {"torchrl", "mani_skill", "sapien", "trimesh"}
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"), [(["lap"], ["lap", "steps"]), (["--rounds", "0"], ["--rounds"]), (["--root", "no"], ["no"])]
+)
+def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    sentence = sentence_of(launch("benchmark.py", *arguments, cwd=tmp_path))
+    assert all(word in sentence for word in words), sentence
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,80 @@
+"""The benchmarks measure what they say, on work that is the same for all sides."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.assets.procedural import generate
+from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.evaluation import benchmark
+from fb3d_rl.evaluation.trials import schedule
+
+OPTIONS = EnvOptions(points=128, camera=CameraOptions(resolution=32), horizon=40)
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> list[ArticulatedObject]:
+    root = tmp_path_factory.mktemp("objects")
+    return [load_object(root / name) for name in generate(root, ["Microwave", "Table"], 1, seed=0)]
+
+
+def silent(text: str) -> None:
+    assert text
+
+
+def test_rates_are_of_the_same_steps(objects: list[ArticulatedObject], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(benchmark, "_stock_env", lambda *_: (None, "not asked for"))
+    episodes = benchmark.expert_episodes(objects, OPTIONS)
+    found = benchmark.step_rates(objects, OPTIONS, rounds=2, progress=silent)
+    assert found["steps"] == sum(len(episode.actions) for episode in episodes) > 20
+    assert found["no observation, steps/s"] > found["point cloud, steps/s"] > 0
+    assert 0.1 < found["point cloud / no observation"] < 1
+    assert found["ManiSkill's point cloud"] == "not measured: not asked for"
+
+
+def test_one_core_is_given_back() -> None:
+    threads = torch.get_num_threads()
+    before = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    with pytest.raises(KeyError), benchmark.one_core():
+        assert torch.get_num_threads() == 1
+        if before is not None:
+            assert len(os.sched_getaffinity(0)) == 1
+        raise KeyError
+    assert torch.get_num_threads() == threads
+    if before is not None:
+        assert os.sched_getaffinity(0) == before
+
+
+def test_an_object_is_loaded_faster_again(objects: list[ArticulatedObject]) -> None:
+    found = benchmark.loading(objects, OPTIONS, silent)
+    assert found["objects"] == 2
+    assert found["load again, ms"] < found["first load, ms"]
+    assert found["load again, slowest object, ms"] >= found["load again, ms"]
+
+
+def test_random_actions_leave_numbers_and_memory_alone(objects: list[ArticulatedObject]) -> None:
+    found = benchmark.soak(objects, OPTIONS, steps=200, seed=0, progress=silent)
+    assert found["steps"] == 200 and found["entries that are not finite"] == 0
+    assert 0.9 < found["memory after / before"] < 1.1
+
+
+@pytest.mark.slow
+def test_workers_are_compared_without_their_start(objects: list[ArticulatedObject]) -> None:
+    scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(points=128), seed=0)
+    found = benchmark.worker_scaling(objects, 3 * scheduled, OPTIONS, rounds=1, progress=silent)
+    assert found["trials"] == 3 * len(scheduled)
+    assert found["two workers / one"] == pytest.approx(
+        found["two workers, trials/s"] / found["one worker, trials/s"], rel=1e-6
+    )
+
+
+def test_a_table_has_every_number() -> None:
+    rows = list(benchmark.rows({"steps": {"a": 1234.5, "b": 0.5123, "objects": ["x"], "c": "not measured"}}))
+    assert rows == [("steps", "a", "1234"), ("steps", "b", "0.512"), ("steps", "c", "not measured")]
