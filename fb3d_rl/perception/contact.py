@@ -28,6 +28,7 @@ class ContactOptions:
         clearance: where that cylinder starts, in front of the point, m.
         reach: where that cylinder ends, m.
         hand_length: from the tip to the hand's far end, m.
+        run_up: straight way (m) that the tip needs above the ground before it touches.
         weak_flow: share of the largest flow that does if no point with more can be moved freely.
         candidates: points whose way along the flow is checked.
         sweep: how far along its way a point has to be free, m; ``sweep_angle`` (rad) if that is less.
@@ -44,6 +45,7 @@ class ContactOptions:
     clearance: float = 0.06
     reach: float = 0.6
     hand_length: float = 0.15
+    run_up: float = 0.1
     weak_flow: float = 0.1
     candidates: int = 64
     sweep: float = 1.0
@@ -152,8 +154,8 @@ def _blocked(
 
 
 def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
-    """Whether the hand's far end would be below the ground z = 0, [B, N] bool."""
-    return points[..., 2] + options.hand_length * standoff[..., 2] < 0
+    """Whether the hand's far end would come from below the ground z = 0, [B, N] bool."""
+    return points[..., 2] + (options.run_up + options.hand_length) * standoff[..., 2] < 0
 
 
 def _clear(

@@ -257,7 +257,10 @@ class FlowPolicy(TensorDictModuleBase):
         from_centre = contact - centre
         b = (from_centre * standoff).sum(-1, keepdim=True)
         c = from_centre.square().sum(-1, keepdim=True) - radius.square()
-        t = (-b + (b * b - c).clamp_min(0).sqrt()).clamp_min(2 * o.precontact)
+        t = -b + (b * b - c).clamp_min(0).sqrt()
+        descent = -standoff[..., 2:]
+        above_ground = (contact[..., 2:] - o.clearance) / descent.clamp_min(1e-6)
+        t = torch.where(descent > 0, torch.minimum(t, above_ground), t).clamp_min(2 * o.precontact)
         goal = contact + t * standoff
 
         outward, distance = normalize(tip - centre), (tip - centre).norm(dim=-1, keepdim=True)

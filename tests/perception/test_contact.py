@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
 from fb3d_rl.perception.contact import ContactOptions, choose_contact
@@ -111,8 +112,9 @@ def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_l
     assert torch.allclose(standoff, torch.nn.functional.normalize(camera - contact), atol=1e-4)
 
 
-def test_the_hand_does_not_come_from_below_the_ground() -> None:
-    points = plate()[..., [1, 2, 0]] + torch.tensor([0.0, 0.0, 0.1])  # a lying plate that moves down
+@pytest.mark.parametrize("height", [0.1, 0.2])
+def test_the_hand_does_not_come_from_below_the_ground(height: float) -> None:
+    points = plate()[..., [1, 2, 0]] + torch.tensor([0.0, 0.0, height])  # a lying plate that moves down
     flow = torch.tensor([0.0, 0.0, -1.0]).expand_as(points).clone()
     camera = torch.tensor([[-3.0, 0.0, 0.05]])  # seen from below
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
