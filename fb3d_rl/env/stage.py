@@ -168,6 +168,7 @@ class Stage:
         goal: position (rad or m) of that joint when it is open.
         sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
         moved: [L] bool, the links that the joint carries.
+        direction: [J], ``sign`` at the target and 0 elsewhere.
         scene: the environment's own scene.
         links: the object's links in the simulator, in the order of ``object.links``.
         order: column of each of the J joints in the simulator's joint state.
@@ -196,6 +197,8 @@ class Stage:
             raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
         self.sign = 1.0 if self.goal > trial.start[self.target] else -1.0
         self.moved = model.tree.descendants[self.target]
+        self.direction = torch.zeros(len(obj.movable), dtype=torch.float64)
+        self.direction[self.target] = self.sign
 
     @property
     def object(self) -> ArticulatedObject:

@@ -444,6 +444,8 @@ class OpenArticulatedEnv(BaseEnv):
         return torch.from_numpy(np.array(rows)).to(self.device)
 
     def _stacked(self, parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+        if len(parts) == 1:  # without a copy
+            return {key: value[None].to(self.device) for key, value in parts[0].items()}
         return {key: torch.stack([part[key] for part in parts]).to(self.device) for key in parts[0]}
 
     def _cloud(self, e: int, poses: NDArray[np.float64]) -> dict[str, Tensor]:
@@ -457,9 +459,7 @@ class OpenArticulatedEnv(BaseEnv):
         rng = np.random.default_rng([stage.trial.seed, int(self._elapsed_steps[e])])
         cloud, ids = sample_cloud(*seen, self.options.points, rng)
         link, world = torch.from_numpy(ids), torch.from_numpy(cloud)
-        direction = torch.zeros(len(stage.object.movable), dtype=torch.float64)
-        direction[stage.target] = stage.sign
-        flow = articulation_flow(stage.tree, world, link, torch.from_numpy(poses[: len(stage.links)]), direction)
+        flow = articulation_flow(stage.tree, world, link, torch.from_numpy(poses[: len(stage.links)]), stage.direction)
         valid = link >= 0
         return {
             "points": world,

@@ -100,18 +100,18 @@ class ManiSkillEnv(EnvBase):
     def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
         content = dict(obs) if isinstance(obs, dict) else {"observation": obs}
         content |= {key: info[key] for key in self._info_keys}
-        return TensorDict(self._entries(content), batch_size=self.batch_size, device=self.device)
+        return self._group(content)
 
-    def _entries(self, content: dict[str, Any]) -> dict[str, Any]:
+    def _group(self, content: dict[str, Any]) -> TensorDict:
         """Entries of at least two dimensions each; groups without an entry, which TorchRL refuses, are left out."""
         entries: dict[str, Any] = {}
         for key, value in content.items():
-            if isinstance(value, dict):
-                if group := self._entries(value):
-                    entries[key] = group
-            else:
+            if not isinstance(value, dict):
                 entries[key] = self._entry(value)
-        return entries
+            elif value:
+                entries[key] = self._group(value)
+        # As in TorchRL's own libraries, without the checks of each entry at each step.
+        return TensorDict._new_unsafe(source=entries, batch_size=self.batch_size, device=self.device)
 
     def _entry(self, value: Tensor) -> Tensor:
         # A copy, since ManiSkill hands out buffers of its own.
