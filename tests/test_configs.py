@@ -223,3 +223,19 @@ def test_infinity_can_be_given() -> None:
 @pytest.mark.parametrize("split", ["test", "[train_test,test]", "[test,Laptop,10098]", "10098"])
 def test_splits_can_be_given_as_a_name_an_id_or_a_list(split: str) -> None:
     validate(compose("train", "assets=partnet_mobility", "assets.root=.", f"assets.split={split}"))
+
+
+def documented_commands() -> list[str]:
+    """Lines `python launch/...` and `make ...` of the README and of results/."""
+    text = "\n".join(path.read_text() for path in (ROOT / "README.md", *sorted((ROOT / "results").glob("**/*.md"))))
+    return sorted(set(re.findall(r"python launch/[a-z]+\.py[^`\n#]*", text)))
+
+
+@pytest.mark.parametrize("command", documented_commands())
+def test_documented_commands_are_understood(command: str, tmp_path: Path) -> None:
+    script, *words = command.replace("DIR", str(tmp_path)).split()[1:]
+    assert (ROOT / script).is_file()
+    name, sweep = Path(script).stem, "-m" in words
+    if name in ("train", "evaluate"):
+        chosen = [word.split(",")[0] if sweep else word for word in words if not word.startswith(("hydra.", "-"))]
+        validate(compose(name, *chosen))
