@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import cycle
 from statistics import median
 from typing import Any
 
@@ -74,7 +75,7 @@ def step_rates(
     episodes = expert_episodes(objects, options)
     steps = sum(len(episode.actions) for episode in episodes)
     trials = [episode.trial for episode in episodes]
-    ours = {mode: make_env(objects, options, trials, obs_mode=mode) for mode in ("none", "pointcloud")}
+    ours = {mode: make_env(objects, options, cycle(trials), obs_mode=mode) for mode in ("none", "pointcloud")}
     stock, reason = _stock_env(objects, options)
 
     def through_torchrl(mode: str) -> float:
@@ -182,7 +183,7 @@ def _trials_per_second(
 
 def loading(objects: Sequence[ArticulatedObject], options: EnvOptions, progress: Progress) -> dict[str, Any]:
     """Time that a reset to an object takes, the first time and again, with all the others in between."""
-    env = make_env(objects, options, [default_trial(obj) for obj in objects])
+    env = make_env(objects, options, cycle([default_trial(obj) for obj in objects]))
     times: list[list[float]] = []
     with one_core():
         for turn in ("first", "second", "third"):
@@ -210,7 +211,7 @@ def soak(
 
     Memory is compared between the ends of the two visits: in the first one every object is prepared and kept.
     """
-    env = make_env(objects, options, [default_trial(obj) for obj in objects])
+    env = make_env(objects, options, cycle([default_trial(obj) for obj in objects]))
     generator = torch.Generator().manual_seed(seed)
     process, resident = psutil.Process(), []
     per_visit, done, broken = max(1, steps // (2 * len(objects))), 0, 0
