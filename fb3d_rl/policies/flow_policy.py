@@ -107,6 +107,7 @@ class FlowPolicy(TensorDictModuleBase):
         "idle": ((1,), torch.int64),
         "leave": ((3,), torch.float32),
         "tip": ((3,), torch.float32),
+        "came": ((3,), torch.float32),
         "tried": ((TRIES, 3), torch.float32),
         "tries": ((1,), torch.int64),
     }
@@ -165,29 +166,41 @@ class FlowPolicy(TensorDictModuleBase):
         phase = state["phase"].squeeze(-1)
         attached = obs["attached"].squeeze(-1)
 
-        pressed = (phase == APPROACH) & (obs["contact_force"].squeeze(-1) > o.force)
-        progress = ((tip - state["tip"]) * state["pull"]).sum(-1)
+        touches = obs["contact_force"].squeeze(-1) > o.force
+        pressed = (phase == APPROACH) & touches
+        moved = tip - state["tip"]
+        halted = ((phase == TRAVEL) | (phase == RETREAT)) & touches & (moved.norm(dim=-1) < o.stuck_progress)
+        state["came"] = torch.where((phase == TRAVEL)[:, None], 0.8 * state["came"] - moved, 0.0)
+        progress = (moved * state["pull"]).sum(-1)
         state["tip"] = tip.clone()
         idle = (phase == PULL) & attached & (progress < o.stuck_progress)
-        count = torch.where(pressed | idle | (phase == RELEASE), state["idle"].squeeze(-1) + 1, 0)
+        count = torch.where(pressed | halted | idle | (phase == RELEASE), state["idle"].squeeze(-1) + 1, 0)
         offset = tip - state["contact_point"]
         height = (offset * state["standoff"]).sum(-1)
         failed = (phase == APPROACH) & ((count > o.patience) | (height < -o.overshoot)) & ~attached
+        blocked = (phase == TRAVEL) & (
+            count > o.stuck_steps
+        )  # something stands in the way that the cloud does not show
         stuck = (phase == PULL) & (count > o.stuck_steps)
+        in_vain = failed | blocked | stuck
         slot = (state["tries"] % TRIES)[..., None].expand(-1, 1, 3)
         remembered = state["tried"].scatter(1, slot, torch.where(stuck[:, None], tip, state["contact_point"])[:, None])
-        state["tried"] = torch.where((failed | stuck)[:, None, None], remembered, state["tried"])
-        state["tries"] = state["tries"] + (failed | stuck)[:, None].long()
+        state["tried"] = torch.where(in_vain[:, None, None], remembered, state["tried"])
+        state["tries"] = state["tries"] + in_vain[:, None].long()
 
         lost = ((phase == PULL) | (phase == RELEASE)) & ~attached
-        given_up = failed | lost
+        given_up = failed | blocked | lost
         state["leave"] = torch.where((failed | (lost & (phase == PULL)))[:, None], state["standoff"], state["leave"])
         state["leave"] = torch.where(stuck[:, None], _across(hand, state["pull"]), state["leave"])
-        state["contact_point"] = torch.where(lost[:, None], tip, state["contact_point"])
-        state["standoff"] = torch.where(lost[:, None], hand, state["standoff"])
+        state["leave"] = torch.where(blocked[:, None], normalize(state["came"]), state["leave"])
+        # It backs off from where it is, not from a contact point that is far away.
+        astray = (lost | blocked)[:, None]
+        state["contact_point"] = torch.where(astray, tip, state["contact_point"])
+        state["standoff"] = torch.where(astray, hand, state["standoff"])
         vain = (phase == RELEASE) & (count > 3 * o.stuck_steps)  # it does not come off: pull on
 
-        backed_off = (phase == RETREAT) & ((offset * state["leave"]).sum(-1) > o.precontact)
+        far_off = (offset * state["leave"]).sum(-1) > o.precontact
+        backed_off = (phase == RETREAT) & (far_off | (count > o.stuck_steps))
         aligned = alignment(hand, state["standoff"]).norm(dim=-1) < 0.15
         on_line = (offset - height[:, None] * state["standoff"]).norm(dim=-1) < 0.04
         ready = (phase == TRAVEL) & aligned & on_line & (height > 0)

@@ -201,6 +201,22 @@ def test_a_flat_state_restores_all_of_it(env: OpenArticulatedEnv, objects: dict[
                 torch.testing.assert_close(value, seen[group][key], atol=1e-4, rtol=0, msg=key)
 
 
+def test_a_stage_takes_another_trial_with_what_is_built(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    """What a reset of some of several environments does: their objects stay."""
+    obj = objects["StorageFurniture"]
+    drawer, door = links_called(obj, "drawer")[0], links_called(obj, "rotation_door")[0]
+    start(env, obj, drawer)
+    built = env.stages[0]
+    placed = built.place(default_trial(obj, door))
+    assert placed.links is built.links and placed.static is built.static and placed.order == built.order
+    assert obj.movable[placed.target] == door and bool(placed.moved[door]) and not bool(placed.moved[drawer])
+    assert placed.direction.tolist() == [placed.sign * (link == door) for link in obj.movable]
+    with pytest.raises(UserError, match="trials"):
+        env.reset(options={"trials": [default_trial(obj), default_trial(obj)]})
+
+
 def test_an_episode_is_truncated_at_the_horizon(objects: dict[str, ArticulatedObject]) -> None:
     env = OpenArticulatedEnv([objects["Table"]], EnvOptions(points=POINTS, horizon=4))
     env.reset()

@@ -289,3 +289,30 @@ def test_a_hand_that_is_held_by_chance_keeps_its_direction() -> None:
     hand = -euler_xyz_to_matrix(door.qpos[:, 3:6])[..., 0]
     assert int(state["phase"]) == PULL
     assert torch.allclose(state["standoff"], hand, atol=1e-5)
+
+
+def test_a_hand_that_is_halted_on_its_way_goes_back_as_it_came_and_tries_elsewhere() -> None:
+    policy, door = expert_policy(LIMITS), ToyDoor()
+    state, phases, wall = policy.initial_state((1,)), [], True
+    first: Tensor | None = None
+    for _ in range(150):
+        td = door.observe(state)
+        halted = wall and float(door.tip()[0, 0]) > -1.0  # something that the cloud does not show
+        td["observation", "contact_force"] = torch.full((1, 1), 1000.0 * halted)
+        td = policy(td)
+        state = td["next", "policy"]
+        phases.append(int(state["phase"]))
+        if phases[-1] == TRAVEL and first is None:
+            first = state["contact_point"].clone()
+        if phases[-1] == RETREAT and wall:
+            wall = False
+            assert float(policy_velocity(td["action"])[0]) < -0.5, "it came along +x"
+            torch.testing.assert_close(state["tried"][0, :1], first)
+        if not (halted and phases[-1] == TRAVEL):
+            door.step(td["action"])
+        if door.opened > 0.5:
+            break
+    assert not wall and APPROACH not in phases[: phases.index(RETREAT)]
+    assert PULL in phases and door.opened > 0.5
+    second = phases.index(TRAVEL, phases.index(RETREAT))
+    assert SELECT not in phases[second:], "it chose another point at once"
