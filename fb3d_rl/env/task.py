@@ -116,7 +116,6 @@ class OpenArticulatedEnv(BaseEnv):
         self.stages = []
         self._models: dict[str, Model] = {}
         self._trial_rng = np.random.default_rng(0)
-        self._contact = torch.zeros(0)
         if self.options.camera.kind == "sapien" or kwargs.get("obs_mode") == "rgbd":
             kwargs.setdefault("render_backend", require_renderer())
         super().__init__(
@@ -156,13 +155,13 @@ class OpenArticulatedEnv(BaseEnv):
         if seed is not None:
             self._trial_rng = np.random.default_rng(seed)
         which = sorted(int(i) for i in options.get("env_idx", range(self.num_envs)))
+        full = len(which) == self.num_envs
         trials = options.pop("trials", None)
         if trials is None:
-            trials = [self._draw_trial() for _ in which]
+            trials = [self._draw_trial(None if full else self.stages[i]) for i in which]
         if len(trials) != len(which):
             raise UserError(f"{len(trials)} trials for {len(which)} environments; give one for each that is reset")
         drafts = [Stage(trial, self._model(trial.object)) for trial in trials]
-        full = len(which) == self.num_envs
         same = bool(self.stages) and all(
             self.stages[i].object is draft.object for i, draft in zip(which, drafts, strict=True)
         )
@@ -188,9 +187,12 @@ class OpenArticulatedEnv(BaseEnv):
             self._models[name] = Model(self.objects[name], self.options)
         return self._models[name]
 
-    def _draw_trial(self) -> Trial:
-        """A trial from the environment's own generator; its view shows the part if one of ``VIEW_TRIES`` does."""
-        rng, names = self._trial_rng, list(self.objects)
+    def _draw_trial(self, stage: Stage | None = None) -> Trial:
+        """A trial from the environment's own generator; its view shows the part if one of ``VIEW_TRIES`` does.
+
+        With a ``stage`` it is one that can run there without building: the object stays, a rendered camera too.
+        """
+        rng, names = self._trial_rng, list(self.objects) if stage is None else [stage.object.id]
         for i in rng.permutation(len(names)):
             model = self._model(names[i])
             links = [j for j in model.links if self.link in (None, model.object.links[j].name)]
@@ -203,8 +205,10 @@ class OpenArticulatedEnv(BaseEnv):
         fraction = float(rng.uniform(0.0, 0.9)) if self.options.start == "random" else None
         for _ in range(VIEW_TRIES):
             view = self.options.views.sample(rng)
+            if stage is not None and self.scene.can_render():
+                view = stage.trial.view
             trial = default_trial(model.object, link, view, seed, 0.0 if self.options.start == "closed" else fraction)
-            # The hand starts beside the view; it stands where it hides nothing.
+            # The hand is far away, where it hides nothing.
             poses = np.concatenate([model.poses(trial.start), np.tile(np.eye(4), (len(BODIES), 1, 1))])
             poses[len(model.object.links) :, 2, 3] = -1e3
             _, seen = model.camera.capture(poses, view)

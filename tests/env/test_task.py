@@ -213,6 +213,7 @@ def test_a_stage_takes_another_trial_with_what_is_built(
     assert placed.links is built.links and placed.static is built.static and placed.order == built.order
     assert obj.movable[placed.target] == door and bool(placed.moved[door]) and not bool(placed.moved[drawer])
     assert placed.direction.tolist() == [placed.sign * (link == door) for link in obj.movable]
+    assert {env._draw_trial(built).object for _ in range(5)} == {obj.id}, "what is drawn for it is of its object"
     with pytest.raises(UserError, match="trials"):
         env.reset(options={"trials": [default_trial(obj), default_trial(obj)]})
 
