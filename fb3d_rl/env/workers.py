@@ -13,6 +13,7 @@ import queue
 import signal
 import tempfile
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -201,10 +202,13 @@ class Workers:
             while not jobs.empty():
                 yield Episode(jobs.get(), error="not run: every worker died, and collector.restarts is used up")
         finally:
-            if working:
-                self._stop()
+            while working and any(thread.is_alive() for thread in threads):
+                self._stop()  # more than once: a process may just be about to start
+                time.sleep(0.05)
             for thread in threads:
                 thread.join()
+            if working:
+                self._stop()
 
     def update_policy_weights_(self) -> None:
         """Give the workers the policy's present weights."""

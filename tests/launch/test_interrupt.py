@@ -41,7 +41,14 @@ def test_nothing_is_left_behind(tmp_path: Path, after: float) -> None:
     with (
         (tmp_path / "stderr").open("w") as stderr,
         subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL, stderr=stderr, start_new_session=True
+            command,
+            cwd=tmp_path,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=stderr,
+            start_new_session=True,
+            # A shell that runs the tests in the background has SIGINT ignored, which children inherit.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         ) as process,
     ):
         until = time.monotonic() + 120
