@@ -421,7 +421,7 @@ def _start_ray() -> bool:
         ) from error
     if ray.is_initialized():
         return False
-    ray.init(logging_level="warning")
+    ray.init(logging_level=logging.WARNING)
     # TorchRL says so of the policy factory; Workers.update_policy_weights_ does update.
     warnings.filterwarnings("ignore", message="The policy is not an nn.Module")
     return True
