@@ -249,6 +249,7 @@ class Workers:
                     except Exception:
                         if not again:
                             raise
+                        # Not the end of the run: it is logged, and the next attempt counts as a restart too.
                         log.exception("a worker could not be started again")
                         continue
                 try:

@@ -22,7 +22,7 @@ from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.evaluation.rollout import CollectorOptions, policy_env, run_trials
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import Scheduled
-from fb3d_rl.policies.flow_policy import VelocityLimits, expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicy, VelocityLimits, expert_policy
 
 Progress = Callable[[str], None]
 
@@ -52,7 +52,7 @@ def one_core() -> Iterator[None]:
 
 def expert_episodes(objects: Sequence[ArticulatedObject], options: EnvOptions) -> list[Episode]:
     """One episode of the expert with each object."""
-    expert = expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
+    expert = _expert(options)
     episodes = []
     for obj in objects:
         trial = default_trial(obj)
@@ -126,8 +126,13 @@ def step_rates(
     }
 
 
-def _ratios(slow: Sequence[float], fast: Sequence[float]) -> list[float]:
-    return [a / b for a, b in zip(slow, fast, strict=True)]
+def _ratios(over: Sequence[float], under: Sequence[float]) -> list[float]:
+    """Round by round."""
+    return [a / b for a, b in zip(over, under, strict=True)]
+
+
+def _expert(options: EnvOptions) -> FlowPolicy:
+    return expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
 
 
 def _stock_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> tuple[Any, str]:
@@ -149,7 +154,7 @@ def worker_scaling(
     progress: Progress,
 ) -> dict[str, Any]:
     """Trials of the expert per second with one worker process and with two, start-up left out."""
-    expert = expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
+    expert = _expert(options)
     rates: dict[int, list[float]] = {1: [], 2: []}
     for i in range(rounds):
         for workers, found in rates.items():
