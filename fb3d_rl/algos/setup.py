@@ -23,7 +23,8 @@ from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.video import require_encoder
 from fb3d_rl.perception.contact import ContactOptions
-from fb3d_rl.policies.flow_policy import FlowPolicyOptions, VelocityLimits
+from fb3d_rl.policies.flow_policy import FlowPolicyOptions
+from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:

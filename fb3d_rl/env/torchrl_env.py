@@ -121,7 +121,8 @@ class ManiSkillEnv(EnvBase):
 class TrialEnv(ManiSkillEnv):
     """The task of this package, whose resets start one given trial after the other.
 
-    "trial" [E, 1] is the number of the running trial in what was given to :meth:`set_trials`, -1 if none runs.
+    "trial" [E, 1] is the number of the running trial in what was given to :meth:`set_trials`, -1 if none runs; "seed"
+    [E, 1] is its seed.
 
     Args:
         env: the task.
@@ -163,6 +164,7 @@ class TrialEnv(ManiSkillEnv):
         self._seen = obs, info
         result = super()._read(obs, info)
         result["trial"] = torch.tensor(self._running, device=self.device)[:, None]
+        result["seed"] = torch.tensor([stage.trial.seed for stage in self.env.stages], device=self.device)[:, None]
         return result
 
 

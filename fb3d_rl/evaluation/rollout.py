@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data.tensor_specs import Composite, Unbounded
 from torchrl.envs import EnvBase, TensorDictPrimer, TransformedEnv
@@ -30,12 +30,23 @@ KEYS: tuple[Key, ...] = (
 """What a row is made of."""
 
 
-def policy_env(env: EnvBase) -> EnvBase:
-    """``env`` with the flow policy's state in its TensorDicts, set to its start at every reset."""
-    start = FlowPolicy.initial_state(env.batch_size)
-    specs = {key: Unbounded(shape=value.shape, dtype=value.dtype) for key, value in start.items()}
-    primer = Composite({"policy": Composite(specs, shape=env.batch_size)}, shape=env.batch_size)
-    return TransformedEnv(env, TensorDictPrimer(primer, default_value=0.0))
+def policy_env(env: EnvBase, policy: TensorDictModuleBase | None = None) -> EnvBase:
+    """``env`` with the policy's state in its TensorDicts, set to 0 at every reset.
+
+    That is the flow policy's state, and what else ``policy.initial_state`` lays out.
+    """
+    start = TensorDict({"policy": FlowPolicy.initial_state(env.batch_size)}, batch_size=env.batch_size)
+    if hasattr(policy, "initial_state") and not isinstance(policy, FlowPolicy):
+        start.update(policy.initial_state(env.batch_size))
+    return TransformedEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
+
+
+def _specs_of(start: TensorDictBase) -> Composite:
+    specs = {
+        key: _specs_of(value) if isinstance(value, TensorDictBase) else Unbounded(value.shape, dtype=value.dtype)
+        for key, value in start.items()
+    }
+    return Composite(specs, shape=start.batch_size)
 
 
 def run_trials(

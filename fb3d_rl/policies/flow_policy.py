@@ -13,17 +13,15 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
-from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.transforms import (
     alignment,
-    euler_xyz_jacobian,
     normalize,
-    quaternion_to_matrix,
     rotation_vector_to_matrix,
 )
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.perception.contact import ContactOptions, choose_contact
+from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
 """Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2, 4 and 5, articulation execution (I.G) is 3."""
@@ -78,14 +76,6 @@ class FlowPolicyOptions:
     contact: ContactOptions = field(default_factory=ContactOptions)
 
 
-@dataclass(frozen=True)
-class VelocityLimits:
-    """What action 1 means: m/s, rad/s; has to be the gripper's."""
-
-    linear: float
-    angular: float
-
-
 class FlowPolicy(TensorDictModuleBase):
     """Turns a flow into gripper velocities.
 
@@ -135,7 +125,7 @@ class FlowPolicy(TensorDictModuleBase):
         """Write the action and the next policy state."""
         o, obs = self.options, tensordict["observation"]
         state = tensordict["policy"].clone()
-        tip, hand = obs["tool_pose"][..., :3], self._hand_axis(obs["tool_pose"])
+        tip, hand = obs["tool_pose"][..., :3], hand_axis(obs["tool_pose"])
         flow = torch.where((obs["part_mask"] & obs["valid"])[..., None], tensordict[self.flow_key], 0.0)
 
         self._advance(state, obs, flow, tip, hand)
@@ -151,14 +141,9 @@ class FlowPolicy(TensorDictModuleBase):
         velocity = torch.where(phase == PULL, o.pull_speed * pull, velocity)
         wanted = self._above_ground(state["standoff"], tip)
         angular = o.angular_gain * alignment(hand, wanted)
-        tensordict["action"] = self._joint_velocities(obs, tip, hand, velocity, angular)
+        tensordict["action"] = joint_velocities(obs, hand, velocity, angular, self.limits)
         tensordict["next", "policy"] = state
         return tensordict
-
-    @staticmethod
-    def _hand_axis(tool_pose: Tensor) -> Tensor:
-        """v_1 of I.F [E, 3]: from the suction tip to the hand, which is the tool frame's -x axis."""
-        return -quaternion_to_matrix(tool_pose[..., 3:])[..., 0]
 
     def _advance(self, state: TensorDictBase, obs: TensorDictBase, flow: Tensor, tip: Tensor, hand: Tensor) -> None:
         """Move every environment to the phase that its observation calls for."""
@@ -311,29 +296,6 @@ class FlowPolicy(TensorDictModuleBase):
         flat = normalize(axis[..., :2])
         lifted = torch.cat([flat * (1 - height.square()).sqrt(), height], dim=-1)
         return torch.where(height > axis[..., 2:], lifted, axis)
-
-    def _joint_velocities(
-        self, obs: TensorDictBase, tip: Tensor, hand: Tensor, velocity: Tensor, angular: Tensor
-    ) -> Tensor:
-        """Normalised joint velocities [E, 8] that move the tip at ``velocity`` and turn the hand at ``angular``.
-
-        The hand's spin about its own axis is free, so only the axis is controlled: damped least squares on the part
-        of the Euler Jacobian that turns it, which stays calm where the angles lock.
-        """
-        jacobian = euler_xyz_jacobian(obs["qpos"][..., 3:6])
-        across = torch.eye(3, dtype=hand.dtype, device=hand.device) - hand[..., :, None] * hand[..., None, :]
-        wanted = (across @ angular[..., None]).squeeze(-1)
-        wanted = wanted * (self.limits.angular / wanted.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
-        turning = across @ jacobian
-        gram = turning.mT @ turning + 1e-2 * torch.eye(3, dtype=hand.dtype, device=hand.device)
-        rates = torch.linalg.solve(gram, (turning.mT @ wanted[..., None])).squeeze(-1)
-        rates = rates.clamp(-self.limits.angular, self.limits.angular)
-        omega = (jacobian @ rates[..., None]).squeeze(-1)
-        lever = tip - obs["qpos"][..., :3]
-        linear = (velocity - torch.linalg.cross(omega, lever)) / self.limits.linear
-        linear = linear / linear.abs().amax(-1, keepdim=True).clamp_min(1.0)
-        fingers = torch.zeros(*rates.shape[:-1], ACTION_DIM - 6, dtype=rates.dtype, device=rates.device)
-        return torch.cat([linear, rates / self.limits.angular, fingers], dim=-1)
 
 
 def _across(hand: Tensor, pull: Tensor) -> Tensor:

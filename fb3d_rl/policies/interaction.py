@@ -1,0 +1,176 @@
+"""Expert and learner at one gripper: in every step the expert says what it would do, and a gate says who acts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+
+from fb3d_rl.contract import Key
+from fb3d_rl.policies.flow_policy import RELEASE, RETREAT, SELECT, FlowPolicy
+
+
+class Gate(nn.Module):
+    """Decides in every step who acts: the expert or the learner.
+
+    A gate reads the observation, ("expert", "action"), ("learner", "action") and whatever else the learner wrote below
+    "learner". What changes from round to round (a share, a threshold) is a buffer, so that it reaches the workers with
+    the weights. What changes within an episode is state: it travels in the TensorDict below "gate", as
+    :meth:`initial_state` lays it out, and :meth:`forward` writes its next value below ("next", "gate").
+    """
+
+    in_keys: list[Key] = []
+    """What the gate reads besides its own state."""
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """The gate's state {"gate": ...} at the start of an episode, all 0; empty unless a gate has one."""
+        return TensorDict({}, batch_size=batch)
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """Whether the expert acts [E, 1] bool."""
+        raise NotImplementedError
+
+
+def uniform(tensordict: TensorDictBase, purpose: int, per_step: bool = True) -> Tensor:
+    """A random number [E, 1] from 0 to below 1 for each environment.
+
+    It depends on the trial's seed, the purpose and, if ``per_step``, the step alone, so that an episode is the same
+    whichever worker runs it.
+    """
+    seeds, steps = tensordict["seed"].flatten().tolist(), tensordict["elapsed_steps"].flatten().tolist()
+    draws = [
+        np.random.default_rng([seed, purpose, step if per_step else 0]).random()
+        for seed, step in zip(seeds, steps, strict=True)
+    ]
+    return torch.tensor(draws, dtype=torch.float64)[:, None]
+
+
+class BetaGate(Gate):
+    """DAgger's mixture (Ross, Gordon, Bagnell 2011): the expert acts with probability beta.
+
+    Args:
+        beta: the share of the expert; set anew for every round.
+        per_step: draw for every step; else once for an episode.
+    """
+
+    in_keys: list[Key] = ["seed", "elapsed_steps"]
+    beta: Tensor
+
+    def __init__(self, beta: float = 1.0, per_step: bool = True) -> None:
+        super().__init__()
+        self.register_buffer("beta", torch.tensor(beta, dtype=torch.float64))
+        self.per_step = per_step
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """See :class:`Gate`."""
+        return uniform(tensordict, 1, self.per_step) < self.beta
+
+
+class OracleGate(Gate):
+    """The supplement's "Oracle" (III): the expert drives to the contact point, the learner acts once the part is held.
+
+    Where suction is lost the expert drives back.
+    """
+
+    in_keys: list[Key] = [("observation", "attached")]
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """See :class:`Gate`."""
+        attached: Tensor = tensordict["observation", "attached"]
+        return ~attached
+
+
+class EitherGate(Gate):
+    """The expert acts where any of several gates says so."""
+
+    def __init__(self, *gates: Gate) -> None:
+        super().__init__()
+        self.gates = nn.ModuleList(gates)
+        self.in_keys = [key for gate in gates for key in gate.in_keys]
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """See :class:`Gate`."""
+        state = TensorDict({}, batch_size=batch)
+        for gate in self.gates:
+            state.update(gate.initial_state(batch))
+        return state
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """See :class:`Gate`."""
+        return torch.stack([gate(tensordict) for gate in self.gates]).any(0)
+
+
+class HumanGate(Gate):
+    """HG-DAgger's gate (Kelly et al. 2019): any callable takes over and hands back, such as a person at a keyboard.
+
+    Args:
+        takes_over: called with the TensorDict of the step; returns [E, 1] bool, True where the expert acts. It has to
+            be picklable if it is to run in worker processes.
+    """
+
+    def __init__(self, takes_over: Callable[[TensorDictBase], Tensor]) -> None:
+        super().__init__()
+        self.takes_over = takes_over
+
+    def forward(self, tensordict: TensorDictBase) -> Tensor:
+        """See :class:`Gate`."""
+        return self.takes_over(tensordict)
+
+
+class InteractivePolicy(TensorDictModuleBase):
+    """Expert and learner in one: ("expert", "action") is always the expert's label, "action" that of whoever acts.
+
+    The expert goes along in its own state while the learner acts. It knows then that what happens is not its doing:
+    it does not count steps without progress as failed attempts, and after a lost hold it chooses a contact anew.
+
+    Args:
+        expert: the flow policy with the true flow.
+        learner: reads what it declares, writes "action" and below "learner".
+        gate: who acts.
+        expert_acts_only: leave out the learner, which is not trained yet.
+    """
+
+    def __init__(self, expert: FlowPolicy, learner: TensorDictModuleBase | None, gate: Gate) -> None:
+        super().__init__()
+        self.expert, self.learner, self.gate = expert, learner, gate
+        keys = [*expert.in_keys, *(learner.in_keys if learner is not None else ()), *gate.in_keys]
+        own = {"action", ("expert", "action"), ("learner", "action")}
+        self.in_keys = [key for key in dict.fromkeys(keys) if key not in own] + [("expert", "looks_on")]
+        self.out_keys = ["action", ("expert", "action"), ("expert", "acts"), ("next", "expert", "looks_on")]
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """What travels in the TensorDict besides the flow policy's state; all of it is 0 at the start."""
+        looks_on = torch.zeros(*batch, 1, dtype=torch.bool)
+        state = TensorDict({"expert": {"looks_on": looks_on}}, batch_size=batch)
+        if self.learner is not None and hasattr(self.learner, "initial_state"):
+            state.update(self.learner.initial_state(batch))
+        return state.update(self.gate.initial_state(batch))
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write "action", ("expert", "action") and who acted."""
+        self.look_on(tensordict)
+        self.expert(tensordict)
+        tensordict["expert", "action"] = tensordict["action"]
+        if self.learner is None:
+            acts = torch.ones_like(tensordict["expert", "looks_on"])
+        else:
+            self.learner(tensordict)
+            tensordict["learner", "action"] = tensordict["action"]
+            acts = self.gate(tensordict)
+            tensordict["action"] = torch.where(acts, tensordict["expert", "action"], tensordict["action"])
+        tensordict["expert", "acts"] = acts
+        tensordict["next", "expert", "looks_on"] = ~acts
+        return tensordict
+
+    @staticmethod
+    def look_on(tensordict: TensorDictBase) -> None:
+        """Keep the expert from drawing conclusions from steps that the learner made."""
+        looks_on, state = tensordict["expert", "looks_on"], tensordict["policy"]
+        state["idle"] = torch.where(looks_on, 0, state["idle"])
+        away = (state["phase"] == RETREAT) | (state["phase"] == RELEASE)
+        state["phase"] = torch.where(looks_on & away, SELECT, state["phase"])
