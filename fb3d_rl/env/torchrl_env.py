@@ -131,6 +131,7 @@ class TrialEnv(ManiSkillEnv):
     def __init__(self, env: BaseEnv) -> None:
         self._trials: Iterator[tuple[int, Trial]] | None = None
         self._running = [-1] * env.num_envs
+        self._task: Any = env
         super().__init__(env)
 
     def set_trials(self, trials: Iterable[Trial]) -> None:
@@ -164,7 +165,7 @@ class TrialEnv(ManiSkillEnv):
         self._seen = obs, info
         result = super()._read(obs, info)
         result["trial"] = torch.tensor(self._running, device=self.device)[:, None]
-        result["seed"] = torch.tensor([stage.trial.seed for stage in self.env.stages], device=self.device)[:, None]
+        result["seed"] = torch.tensor([stage.trial.seed for stage in self._task.stages], device=self.device)[:, None]
         return result
 
 

@@ -22,7 +22,8 @@ from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.evaluation.rollout import CollectorOptions, policy_env, run_trials
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import Scheduled
-from fb3d_rl.policies.flow_policy import FlowPolicy, VelocityLimits, expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
+from fb3d_rl.policies.hand import VelocityLimits
 
 Progress = Callable[[str], None]
 

@@ -36,8 +36,9 @@ def policy_env(env: EnvBase, policy: TensorDictModuleBase | None = None) -> EnvB
     That is the flow policy's state, and what else ``policy.initial_state`` lays out.
     """
     start = TensorDict({"policy": FlowPolicy.initial_state(env.batch_size)}, batch_size=env.batch_size)
-    if hasattr(policy, "initial_state") and not isinstance(policy, FlowPolicy):
-        start.update(policy.initial_state(env.batch_size))
+    further = None if isinstance(policy, FlowPolicy) else getattr(policy, "initial_state", None)
+    if further is not None:
+        start.update(further(env.batch_size))
     return TransformedEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
 
 

@@ -26,7 +26,7 @@ def hand_axis(tool_pose: Tensor) -> Tensor:
 
 
 def across(hand: Tensor) -> Tensor:
-    """Projection [..., 3, 3] on the plane across unit hand axes [..., 3]: the hand's spin about its own axis is free."""
+    """Projection [..., 3, 3] on the plane across unit hand axes [..., 3]; the spin about the axis is free."""
     return torch.eye(3, dtype=hand.dtype, device=hand.device) - hand[..., :, None] * hand[..., None, :]
 
 

@@ -101,7 +101,8 @@ class EitherGate(Gate):
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """See :class:`Gate`."""
-        return torch.stack([gate(tensordict) for gate in self.gates]).any(0)
+        decisions: list[Tensor] = [gate(tensordict) for gate in self.gates]
+        return torch.stack(decisions).any(0)
 
 
 class HumanGate(Gate):
@@ -114,11 +115,11 @@ class HumanGate(Gate):
 
     def __init__(self, takes_over: Callable[[TensorDictBase], Tensor]) -> None:
         super().__init__()
-        self.takes_over = takes_over
+        self._takes_over = takes_over
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """See :class:`Gate`."""
-        return self.takes_over(tensordict)
+        return self._takes_over(tensordict)
 
 
 class InteractivePolicy(TensorDictModuleBase):

@@ -22,7 +22,8 @@ from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
-from fb3d_rl.policies.flow_policy import VelocityLimits, expert_policy
+from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.hand import VelocityLimits
 
 CAMERA = CameraOptions(resolution=48)
 OPTIONS = EnvOptions(points=300, camera=CAMERA, horizon=150)

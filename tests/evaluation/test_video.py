@@ -39,7 +39,8 @@ from fb3d_rl.evaluation.video import (
     write_filmstrip,
     write_video,
 )
-from fb3d_rl.policies.flow_policy import VelocityLimits, expert_policy
+from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.hand import VelocityLimits
 
 SMALL = (160, 120)
 OPENING = 0.5

@@ -22,10 +22,10 @@ from fb3d_rl.policies.flow_policy import (
     TRAVEL,
     FlowPolicy,
     FlowPolicyOptions,
-    VelocityLimits,
     artflownet_policy,
     expert_policy,
 )
+from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 DT = 0.05
@@ -176,9 +176,9 @@ def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, floa
     policy, door = expert_policy(LIMITS), ToyDoor()
     door.qpos[:, 3:6] = torch.tensor(angles)
     td = door.observe(policy.initial_state((1,)))
-    tip, hand = door.tip(), policy._hand_axis(td["observation", "tool_pose"])
+    tip, hand = door.tip(), hand_axis(td["observation", "tool_pose"])
     velocity, angular = torch.tensor([[0.3, -0.2, 0.4]]), torch.tensor([[0.2, 0.3, -0.1]])
-    action = policy._joint_velocities(td["observation"], tip, hand, velocity, angular)
+    action = joint_velocities(td["observation"], hand, velocity, angular, LIMITS)
     h = 1e-3
     scale = torch.tensor([LIMITS.linear] * 3 + [LIMITS.angular] * 3 + [0.0] * 2)
     door.qpos = door.qpos + h * action * scale
