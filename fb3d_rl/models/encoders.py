@@ -1,0 +1,62 @@
+"""Encoders of a cloud that the gripper looks at: points around its tip -> one vector."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+def mlp(*widths: int) -> nn.Sequential:
+    """Linear layers with ReLU between them."""
+    layers: list[nn.Module] = []
+    for a, b in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(a, b), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class AttentionPointNet(nn.Module):
+    """PointNet (Qi et al. 2017a) that, knowing the whole cloud, looks again and points at places.
+
+    A first MLP sees every point on its own; the maximum over the points is the cloud's vector, as in PointNet. A
+    second one sees each point beside that vector and scores it for ``heads`` heads; the softmax of a head's scores
+    over the cloud is its attention. What it attends to, as a mean position relative to the tip, mean flow and mean
+    features, is told to the policy exactly: a maximum over features alone would have to encode a place to millimetres.
+
+    Args:
+        inputs: features per point besides its position.
+        context: entries of the vector that goes with the cloud (proprioception).
+        outputs: entries of the result.
+        heads: places that are looked at.
+        width: of the layers.
+        generator: draws the first weights; None leaves them to torch's global generator.
+
+    Shapes:
+        points [B, N, 3] f32, m, relative to the suction tip; features [B, N, inputs]; valid [B, N] bool;
+        context [B, context] -> [B, outputs].
+    """
+
+    SCALES = (0.03, 0.1, 0.3)
+    """Distances (m) from the tip that the network tells apart: touching, near, in front of the object."""
+
+    def __init__(self, inputs: int, context: int, outputs: int, heads: int = 8, width: int = 64) -> None:
+        super().__init__()
+        own = 3 + 3 + len(self.SCALES) + inputs
+        self.local = mlp(own, width, width)
+        self.scene = mlp(width + context, 2 * width, 2 * width)
+        self.again = nn.Linear(width, width)
+        self.told = nn.Linear(2 * width, width)
+        self.score = nn.Linear(width, heads)
+        self.out = mlp(2 * width + heads * (own + width) + context, 4 * width, 4 * width, outputs)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
+        """See the class."""
+        distance = points.norm(dim=-1, keepdim=True)
+        near = [torch.exp(-distance / scale) for scale in self.SCALES]
+        own = torch.cat([points, points / (distance + 0.1), *near, features], dim=-1)
+        local = self.local(own)
+        pooled = local.masked_fill(~valid[..., None], -torch.inf).amax(1).relu()
+        scene = self.scene(torch.cat([pooled, context], dim=-1))
+        again = torch.relu(self.again(local.relu()) + self.told(scene)[:, None])
+        weight = self.score(again).masked_fill(~valid[..., None], -1e9).softmax(1)  # [B, N, heads]
+        attended = weight.mT @ torch.cat([own, again], dim=-1)  # [B, heads, own + width]
+        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1))
