@@ -42,7 +42,7 @@ def budget_threshold(values: Tensor, budget: float) -> float:
         raise UserError(f"budget={budget} is no share; give a number from 0 to 1")
     if not values.numel():
         raise ValueError("no steps to set a threshold by")
-    above = math.floor(budget * values.numel() + 1e-9)  # 0.3 * 10 is below 3
+    above = math.floor(budget * values.numel() + 1e-9)  # 0.29 * 100 is below 29
     if above == values.numel():
         return -math.inf
     return float(values.flatten().kthvalue(values.numel() - above).values)

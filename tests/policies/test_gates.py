@@ -123,6 +123,10 @@ def test_a_budget_is_kept_and_used_up(budget: float, count: int) -> None:
     assert above == math.floor(budget * count + 1e-9)
 
 
+def test_a_budget_is_used_up_where_its_product_falls_short_of_a_whole_number() -> None:
+    assert 0.29 * 100 < 29 and budget_threshold(torch.arange(100), 0.29) == 70
+
+
 def test_a_budget_is_not_exceeded_where_values_are_equal() -> None:
     values = torch.tensor([1.0, 1.0, 1.0, 2.0])
     assert budget_threshold(values, 0.5) == 1.0 and budget_threshold(values, 0.0) == 2.0
