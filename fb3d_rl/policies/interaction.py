@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from fb3d_rl.contract import Key
+from fb3d_rl.contract import Key, UserError
 from fb3d_rl.policies.flow_policy import RELEASE, RETREAT, SELECT, FlowPolicy
 
 
@@ -25,6 +25,15 @@ class Gate(nn.Module):
 
     in_keys: list[Key] = []
     """What the gate reads besides its own state."""
+
+    def tune(self, frames: TensorDictBase, budget: float) -> None:
+        """Set the thresholds, if a budget sets them, by what the last round showed.
+
+        Args:
+            frames: the steps [T] in which the gate had a say, with what it reads, its state and the two actions. What
+                is below "learner" is best that of the learner as it is now.
+            budget: in which share of the steps that the learner would make the expert may take over, 0 to 1.
+        """
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
         """The gate's state {"gate": ...} at the start of an episode, all 0; empty unless a gate has one."""
@@ -55,6 +64,9 @@ class BetaGate(Gate):
     Args:
         beta: the share of the expert; set anew for every round.
         per_step: draw for every step; else once for an episode.
+
+    Raises:
+        UserError: beta is no share.
     """
 
     in_keys: list[Key] = ["seed", "elapsed_steps"]
@@ -62,6 +74,8 @@ class BetaGate(Gate):
 
     def __init__(self, beta: float = 1.0, per_step: bool = True) -> None:
         super().__init__()
+        if not 0.0 <= beta <= 1.0:
+            raise UserError(f"beta={beta} is no share; give a number from 0 to 1")
         self.register_buffer("beta", torch.tensor(beta, dtype=torch.float64))
         self.per_step = per_step
 
@@ -92,17 +106,24 @@ class EitherGate(Gate):
         self.gates = nn.ModuleList(gates)
         self.in_keys = [key for gate in gates for key in gate.in_keys]
 
+    def tune(self, frames: TensorDictBase, budget: float) -> None:
+        """See :class:`Gate`; the budget is that of each gate by itself."""
+        for gate in self._each():
+            gate.tune(frames, budget)
+
     def initial_state(self, batch: torch.Size) -> TensorDict:
         """See :class:`Gate`."""
         state = TensorDict({}, batch_size=batch)
-        for gate in self.gates:
+        for gate in self._each():
             state.update(gate.initial_state(batch))
         return state
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """See :class:`Gate`."""
-        decisions: list[Tensor] = [gate(tensordict) for gate in self.gates]
-        return torch.stack(decisions).any(0)
+        return torch.stack([gate(tensordict) for gate in self._each()]).any(0)  # all are asked: they may keep state
+
+    def _each(self) -> Iterator[Gate]:
+        return (gate for gate in self.gates if isinstance(gate, Gate))  # all are; nn.ModuleList does not know
 
 
 class HumanGate(Gate):
@@ -130,9 +151,12 @@ class InteractivePolicy(TensorDictModuleBase):
 
     Args:
         expert: the flow policy with the true flow.
-        learner: reads what it declares, writes "action" and below "learner".
+        learner: reads what it declares, writes "action" and below "learner"; None while it is not trained yet, so that
+            the expert acts alone.
         gate: who acts.
-        expert_acts_only: leave out the learner, which is not trained yet.
+
+    Raises:
+        ValueError: the learner writes something else that the expert writes too, such as the flow policy's state.
     """
 
     def __init__(self, expert: FlowPolicy, learner: TensorDictModuleBase | None, gate: Gate) -> None:
@@ -140,6 +164,11 @@ class InteractivePolicy(TensorDictModuleBase):
         self.expert, self.learner, self.gate = expert, learner, gate
         keys = [*expert.in_keys, *(learner.in_keys if learner is not None else ()), *gate.in_keys]
         own = {"action", ("expert", "action"), ("learner", "action")}
+        if learner is not None:
+            both = set(learner.out_keys) & set(expert.out_keys) - {"action"}
+            if both:
+                raise ValueError(f"expert and learner both write {sorted(both, key=str)}")
+            own.update(learner.out_keys)
         self.in_keys = [key for key in dict.fromkeys(keys) if key not in own] + [("expert", "looks_on")]
         self.out_keys = ["action", ("expert", "action"), ("expert", "acts"), ("next", "expert", "looks_on")]
 

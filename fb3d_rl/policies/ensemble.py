@@ -1,0 +1,60 @@
+"""Several learners as one policy, whose disagreement says how far it is from what it has learned."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from fb3d_rl.contract import Key
+
+
+class Ensemble(TensorDictModuleBase):
+    """The mean action of M learners and their variance.
+
+    "action" and what all members declare below "learner", such as a predicted discrepancy, are the members' means.
+    ("learner", "variance") [E, 1] is the variance of each of the action's D entries across the members (divided by M,
+    as they are the whole ensemble), averaged over the entries: 1/(D M) sum_d sum_m (a_md - mean_d)^2. That is the
+    novelty of ThriftyDAgger and, since actions are normalised, EnsembleDAgger's variance in one number.
+
+    Every member sees the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
+    keep has to be one of the observation, such as the last actions: the first member writes it for all.
+
+    Args:
+        members: at least one learner; all of them declare the same keys.
+
+    Raises:
+        ValueError: there is no member, or they declare different keys.
+    """
+
+    def __init__(self, members: Sequence[TensorDictModuleBase]) -> None:
+        super().__init__()
+        if not members:
+            raise ValueError("an ensemble needs at least one member")
+        first = members[0]
+        if any(set(m.in_keys) != set(first.in_keys) or set(m.out_keys) != set(first.out_keys) for m in members):
+            raise ValueError("the members of an ensemble declare different keys")
+        self.members = nn.ModuleList(members)
+        self._means: list[Key] = [key for key in first.out_keys if key == "action" or key[0] == "learner"]
+        self._state: list[Key] = [key for key in first.out_keys if key[0] == "next"]
+        self.in_keys = list(first.in_keys)
+        self.out_keys = [*self._means, ("learner", "variance"), *self._state]
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """The state that the members share, at the start of an episode; empty if they have none."""
+        start: Callable[[torch.Size], TensorDict] | None = getattr(self.members[0], "initial_state", None)
+        return TensorDict({}, batch_size=batch) if start is None else start(batch)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the means, the variance and the next state."""
+        outputs = [member(tensordict.select(*self.in_keys)) for member in self.members]
+        for key in self._means:
+            tensordict[key] = torch.stack([output[key] for output in outputs]).mean(0)
+        actions = torch.stack([output["action"] for output in outputs])
+        tensordict["learner", "variance"] = actions.var(0, correction=0).mean(-1, keepdim=True)
+        for key in self._state:
+            tensordict[key] = outputs[0][key]
+        return tensordict
