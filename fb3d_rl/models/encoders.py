@@ -1,9 +1,11 @@
-"""Encoders of a cloud that the gripper looks at: points around its tip -> one vector."""
+"""Encoders of a cloud as the gripper sees it: points around its tip and what it feels -> one vector."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+
+from fb3d_rl.models.pointnet2 import GlobalAbstraction, Level, SetAbstraction
 
 
 def mlp(*widths: int) -> nn.Sequential:
@@ -14,8 +16,54 @@ def mlp(*widths: int) -> nn.Sequential:
     return nn.Sequential(*layers[:-1])
 
 
+class PointNet(nn.Module):
+    """PointNet (Qi et al. 2017): an MLP on every point, the maximum over the points, an MLP on that.
+
+    Args:
+        inputs: features per point besides its position.
+        context: entries of the vector that goes with the cloud (proprioception).
+        outputs: entries of the result.
+        width: of the layers.
+
+    Shapes:
+        points [B, N, 3] f32, m, relative to the suction tip; features [B, N, inputs] f32; valid [B, N] bool; context
+        [B, context] f32 -> [B, outputs]. A cloud without points counts as one whose features are all 0.
+    """
+
+    def __init__(self, inputs: int, context: int, outputs: int, width: int = 64) -> None:
+        super().__init__()
+        self.local = mlp(3 + inputs, width, width, 4 * width)
+        self.out = mlp(4 * width + context, 4 * width, 4 * width, outputs)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
+        """See the class."""
+        local = self.local(torch.cat([points, features], dim=-1)).relu()
+        return self.out(torch.cat([local.masked_fill(~valid[..., None], 0.0).amax(1), context], dim=-1))
+
+
+class PointNet2Encoder(nn.Module):
+    """The downward half of PointNet++ (Qi et al. 2017b), as in ArtFlowNet, then an MLP.
+
+    Args and Shapes: as of :class:`PointNet`; at least one point of the batch is valid.
+    """
+
+    def __init__(self, inputs: int, context: int, outputs: int, width: int = 64) -> None:
+        super().__init__()
+        self.sa1 = SetAbstraction(inputs, (width // 2, width // 2, width), ratio=0.2, radius=0.2, neighbors=32)
+        self.sa2 = SetAbstraction(width, (width, width, 2 * width), ratio=0.25, radius=0.4, neighbors=32)
+        self.sa3 = GlobalAbstraction(2 * width, (2 * width, 4 * width))
+        self.out = mlp(4 * width + context, 4 * width, 4 * width, outputs)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
+        """See :class:`PointNet`."""
+        level = Level.of(points, valid)
+        fine, level1 = self.sa1(level.flat(features), level)
+        middle, level2 = self.sa2(fine, level1)
+        return self.out(torch.cat([self.sa3(middle, level2), context], dim=-1))
+
+
 class AttentionPointNet(nn.Module):
-    """PointNet (Qi et al. 2017a) that, knowing the whole cloud, looks again and points at places.
+    """PointNet that, knowing the whole cloud, looks again and points at places.
 
     A first MLP sees every point on its own; the maximum over the points is the cloud's vector, as in PointNet. A
     second one sees each point beside that vector and scores it for ``heads`` heads; the softmax of a head's scores
@@ -28,17 +76,14 @@ class AttentionPointNet(nn.Module):
         outputs: entries of the result.
         heads: places that are looked at.
         width: of the layers.
-        generator: draws the first weights; None leaves them to torch's global generator.
 
-    Shapes:
-        points [B, N, 3] f32, m, relative to the suction tip; features [B, N, inputs]; valid [B, N] bool;
-        context [B, context] -> [B, outputs].
+    Shapes: as of :class:`PointNet`.
     """
 
     SCALES = (0.03, 0.1, 0.3)
     """Distances (m) from the tip that the network tells apart: touching, near, in front of the object."""
 
-    def __init__(self, inputs: int, context: int, outputs: int, heads: int = 8, width: int = 64) -> None:
+    def __init__(self, inputs: int, context: int, outputs: int, width: int = 64, heads: int = 8) -> None:
         super().__init__()
         own = 3 + 3 + len(self.SCALES) + inputs
         self.local = mlp(own, width, width)
@@ -54,9 +99,18 @@ class AttentionPointNet(nn.Module):
         near = [torch.exp(-distance / scale) for scale in self.SCALES]
         own = torch.cat([points, points / (distance + 0.1), *near, features], dim=-1)
         local = self.local(own)
-        pooled = local.masked_fill(~valid[..., None], -torch.inf).amax(1).relu()
+        local = local.relu()
+        pooled = local.masked_fill(~valid[..., None], 0.0).amax(1)
         scene = self.scene(torch.cat([pooled, context], dim=-1))
-        again = torch.relu(self.again(local.relu()) + self.told(scene)[:, None])
+        again = torch.relu(self.again(local) + self.told(scene)[:, None])
         weight = self.score(again).masked_fill(~valid[..., None], -1e9).softmax(1)  # [B, N, heads]
         attended = weight.mT @ torch.cat([own, again], dim=-1)  # [B, heads, own + width]
         return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1))
+
+
+ENCODERS: dict[str, type[PointNet | PointNet2Encoder | AttentionPointNet]] = {
+    "pointnet": PointNet,
+    "pointnet2": PointNet2Encoder,
+    "attention": AttentionPointNet,
+}
+"""The encoders by name."""

@@ -1,4 +1,4 @@
-"""Fit a flow network to stored clouds: one readable loop.
+"""Fit a network to stored rows: one readable loop, for ArtFlowNet as for the policies that imitate.
 
 A run is a pure function of (model's first weights, rows, options): step k draws its rows and its rotations
 from the seed and k alone. So the state to resume from is the model, the optimizer and a counter, and a
@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -25,6 +25,9 @@ from torch import Tensor, nn
 from torchrl.data import ReplayBuffer
 
 from fb3d_rl.contract import UserError
+
+Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
+"""The loss of a batch of rows [B] in step number k, a scalar."""
 
 SCHEDULES = ("constant", "one_cycle")
 
@@ -98,7 +101,7 @@ def learning_rate(step: int, options: FitOptions) -> float:
     return options.lr * 0.5 * (1 + math.cos(math.pi * (done - warm) / (1 - warm)))
 
 
-def _generator(seed: int, purpose: int, number: int) -> torch.Generator:
+def generator(seed: int, purpose: int, number: int) -> torch.Generator:
     """A generator that depends on its arguments only. A multiplicative hash keeps neighbouring arguments
     apart.
     """
@@ -112,10 +115,32 @@ def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
     passes = place // rows
     chosen = torch.empty_like(place)
     for number in passes.unique().tolist():
-        order = torch.randperm(rows, generator=_generator(options.seed, 1, number))
+        order = torch.randperm(rows, generator=generator(options.seed, 1, number))
         here = passes == number
         chosen[here] = order[place[here] % rows]
     return chosen
+
+
+def flow_objective(model: nn.Module, options: FitOptions) -> Objective:
+    """:func:`flow_loss` of a flow network on clouds that are turned, mirrored and scaled as the options say."""
+
+    def objective(batch: TensorDictBase, step: int) -> Tensor:
+        points, flow = batch["observation", "points"], batch["privileged", "flow"]
+        valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
+        device = points.device
+        if options.rotate:
+            angle = torch.rand(len(points), generator=generator(options.seed, 2, step)).to(device) * (2 * math.pi)
+            points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
+        if options.mirror or options.scale:
+            draws = torch.rand(2, len(points), 1, 1, generator=generator(options.seed, 3, step)).to(device)
+            if options.mirror:
+                reflect = torch.ones_like(points[:, :1])
+                reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
+                points, flow = points * reflect, flow * reflect
+            points = points * (1 + options.scale * (2 * draws[1] - 1))
+        return flow_loss(model(points, valid, part_mask), flow, valid)
+
+    return objective
 
 
 def rotate_about_z(vectors: Tensor, angle: Tensor) -> Tensor:
@@ -168,6 +193,7 @@ def fit(
     buffer: ReplayBuffer | TensorDictBase,
     options: FitOptions,
     *,
+    objective: Objective | None = None,
     device: torch.device | str = "cpu",
     evaluate: Callable[[], dict[str, float]] | None = None,
     log: Callable[[dict[str, Any]], None] | None = None,
@@ -175,13 +201,15 @@ def fit(
     resume: dict[str, Any] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Train a flow network.
+    """Train a network.
 
     Args:
-        model: called as model(points [B, N, 3], valid [B, N], part_mask [B, N]) -> flow [B, N, 3]; trained in
-            place.
-        buffer: rows with ("observation", "points" | "valid" | "part_mask") and ("privileged", "flow").
+        model: trained in place. A flow network is called as model(points [B, N, 3], valid [B, N], part_mask [B, N])
+            -> flow [B, N, 3].
+        buffer: rows that ``objective`` understands; of a flow network, rows with ("observation", "points" | "valid" |
+            "part_mask") and ("privileged", "flow").
         options: see FitOptions.
+        objective: what is minimized; :func:`flow_objective` unless given.
         device: where to train; the model is moved there.
         evaluate: measures the model, which is in evaluation mode meanwhile; its numbers go to the log.
         log: receives rows {"step": ..., "train/loss": ..., ...}; keys that start with "time/" differ between
@@ -203,6 +231,7 @@ def fit(
     if rows == 0:
         raise UserError("There are no clouds to train on: generate flow samples first.")
     model.to(device).train()
+    objective = objective or flow_objective(model, options)
     optimizer = torch.optim.Adam(model.parameters(), lr=options.lr)
     step, loss_sum, loss_count = 0, 0.0, 0
     if resume is not None:
@@ -222,29 +251,17 @@ def fit(
         }
 
     def update() -> float:
-        """One step: draw, turn, predict, descend; returns the loss."""
+        """One step: draw, predict, descend; returns the loss."""
         batch = buffer[batch_rows(step, rows, options)].to(device)
-        points, flow = batch["observation", "points"], batch["privileged", "flow"]
-        valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
-        if options.rotate:
-            angle = torch.rand(len(points), generator=_generator(options.seed, 2, step)).to(device) * (2 * math.pi)
-            points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
-        if options.mirror or options.scale:
-            draws = torch.rand(2, len(points), 1, 1, generator=_generator(options.seed, 3, step)).to(device)
-            if options.mirror:
-                reflect = torch.ones_like(points[:, :1])
-                reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
-                points, flow = points * reflect, flow * reflect
-            points = points * (1 + options.scale * (2 * draws[1] - 1))
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, options)
         optimizer.zero_grad()
-        loss = flow_loss(model(points, valid, part_mask), flow, valid)
-        loss.backward()
+        value = objective(batch, step)
+        value.backward()
         if options.clip_norm is not None:
             nn.utils.clip_grad_norm_(model.parameters(), options.clip_norm)
         optimizer.step()
-        return loss.item()
+        return value.item()
 
     def due(every: int | None) -> bool:
         return step == options.steps or (every is not None and step % every == 0)

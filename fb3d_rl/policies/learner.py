@@ -1,0 +1,286 @@
+"""What imitation trains: from a cloud and what the hand feels straight to velocities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import (
+    InteractionType,
+    ProbabilisticTensorDictModule,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
+from torch import Tensor, nn
+from torchrl.modules import IndependentNormal
+
+from fb3d_rl.contract import Key, UserError
+from fb3d_rl.models.dense import initialize
+from fb3d_rl.models.encoders import ENCODERS
+from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
+
+TWIST = 6
+"""Tip velocity and turning of the hand in the world, each as a share of the gripper's limit."""
+
+VECTORS, SCALARS = 3, 3
+FELT = 3 * VECTORS + SCALARS
+"""What the hand feels: its axis, its tip's velocity and its turning (all in the world); held, force, tip's height."""
+
+INPUTS = ("points", "features", "valid", "felt")
+"""Entries of what the network sees."""
+
+FULL_FORCE = 50.0
+"""Contact force (N) beyond which the learner feels no difference."""
+
+SEEN: tuple[Key, ...] = tuple(
+    ("observation", key)
+    for key in ("points", "valid", "part_mask", "qpos", "qvel", "tool_pose", "attached", "contact_force")
+)
+"""What every learner reads."""
+
+FLOW_KEYS: dict[str, Key | None] = {
+    "none": None,
+    "ground_truth": ("privileged", "flow"),
+    "artflownet": ("prediction", "flow"),
+}
+"""Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
+
+
+@dataclass(frozen=True)
+class LearnerOptions:
+    """The learner's network.
+
+    Attributes:
+        encoder: "attention", "pointnet" or "pointnet2", see :mod:`fb3d_rl.models.encoders`.
+        head: "deterministic", or "gaussian": a mean and a standard deviation; the mean is executed.
+        flow: the flow as a further input of each point: "none", "ground_truth", or "artflownet" for its prediction.
+        points: the first so many points of a cloud are looked at; they come in random order.
+        width: of the network's layers.
+        history: control steps before the present one whose feelings it remembers.
+        chunk: control steps that it plans ahead ...
+        execute: ... of which this many are executed before it looks again.
+        discrepancy: whether it also predicts its distance from the expert, which some gates ask for.
+    """
+
+    encoder: Literal["attention", "pointnet", "pointnet2"] = "attention"
+    head: Literal["deterministic", "gaussian"] = "deterministic"
+    flow: Literal["none", "ground_truth", "artflownet"] = "none"
+    points: int = 256
+    width: int = 64
+    history: int = 3
+    chunk: int = 1
+    execute: int = 1
+    discrepancy: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            UserError: a value is unknown or out of range.
+        """
+        for name, choices in (("encoder", ENCODERS), ("head", ("deterministic", "gaussian")), ("flow", FLOW_KEYS)):
+            if getattr(self, name) not in choices:
+                raise UserError(f"{name}={getattr(self, name)} is unknown; choose from {', '.join(choices)}")
+        for name, least in (("points", 16), ("width", 4), ("history", 0), ("chunk", 1), ("execute", 1)):
+            if getattr(self, name) < least:
+                raise UserError(f"{name}={getattr(self, name)} is too small; give {least} or more")
+        if self.execute > self.chunk:
+            raise UserError(f"execute={self.execute} is more than the chunk={self.chunk} that is planned")
+
+
+class TwistNetwork(nn.Module):
+    """An encoder and its heads.
+
+    Args:
+        options: the network.
+
+    Shapes: :meth:`Learner.look`'s entries -> twist [B, chunk, 6], or of the Gaussian head mean and standard deviation;
+    then, if asked for, the discrepancy [B, 1].
+    """
+
+    def __init__(self, options: LearnerOptions) -> None:
+        super().__init__()
+        self.options = options
+        planned = TWIST * options.chunk
+        outputs = planned * (2 if options.head == "gaussian" else 1) + int(options.discrepancy)
+        inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
+        self.encoder = ENCODERS[options.encoder](inputs, FELT * (1 + options.history), outputs, options.width)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> Any:
+        """See the class; a single output comes by itself."""
+        raw = self.encoder(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
+        planned = TWIST * self.options.chunk
+        parts = [raw[:, :planned].unflatten(-1, (-1, TWIST))]
+        if self.options.head == "gaussian":
+            # A lower bound keeps the likelihood of labels that repeat exactly finite.
+            parts.append(nn.functional.softplus(raw[:, planned : 2 * planned]).unflatten(-1, (-1, TWIST)) + 0.02)
+        if self.options.discrepancy:
+            parts.append(nn.functional.softplus(raw[:, -1:]))
+        return tuple(parts) if len(parts) > 1 else parts[0]
+
+
+class Learner(TensorDictModuleBase):
+    """A policy that imitates: cloud, hand and part mask -> velocities.
+
+    It sees the cloud from the suction tip, in the world's axes, and says how the tip shall move and the hand turn
+    there. So it does the same wherever the scene stands, and what it does turns and is mirrored with the scene, which
+    training makes use of. The known kinematics of the hand turn that into the contract's action; the fingers stay
+    closed, as in the supplement (II.C).
+
+    Args:
+        options: the network.
+        limits: what action 1 means.
+        generator: draws the first weights; None leaves them to torch's global generator.
+
+    Shapes: reads the contract's observation [E, ...]; writes "action" [E, 8] and, if asked for, ("learner",
+    "discrepancy") [E, 1]. Its memory and its plan travel below "learner", see :meth:`initial_state`.
+    """
+
+    def __init__(
+        self, options: LearnerOptions, limits: VelocityLimits, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        self.options, self.limits = options, limits
+        flow = FLOW_KEYS[options.flow]
+        self.flow_key = flow
+        self.network = TwistNetwork(options)
+        if generator is not None:
+            initialize(self.network, generator)
+        self.in_keys = [*SEEN, *([flow] if flow else ()), *(("learner", key) for key in self._state())]
+        self.out_keys = ["action", *(("next", "learner", key) for key in self._state())]
+        if options.discrepancy:
+            self.out_keys.append(("learner", "discrepancy"))
+
+    def _state(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
+        state: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
+        if self.options.history:
+            state["felt"] = ((self.options.history, FELT), torch.float32)
+        if self.options.execute > 1:
+            state["plan"] = ((self.options.execute - 1, TWIST), torch.float32)
+            state["planned"] = ((1,), torch.int64)
+        return state
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """What it remembers and plans {"learner": ...}, all 0 at the start of an episode."""
+        state = {key: torch.zeros(*batch, *shape, dtype=dtype) for key, (shape, dtype) in self._state().items()}
+        return TensorDict({"learner": state} if state else {}, batch_size=batch)
+
+    def look(self, rows: TensorDictBase) -> TensorDict:
+        """The network's inputs [B] of rows [B]: "points", "features", "valid" and "felt" [B, 1 + history, FELT]."""
+        obs, count = rows["observation"], self.options.points
+        tip = obs["tool_pose"][..., :3]
+        features = [obs["part_mask"][:, :count, None].to(tip.dtype)]
+        if self.flow_key is not None:
+            features.append(rows[self.flow_key][:, :count])
+        felt = feel(obs, self.limits)[:, None]
+        if self.options.history:
+            felt = torch.cat([felt, rows["learner", "felt"]], dim=1)
+        return TensorDict(
+            {
+                "points": obs["points"][:, :count] - tip[:, None],
+                "features": torch.cat(features, dim=-1),
+                "valid": obs["valid"][:, :count],
+                "felt": felt,
+            },
+            batch_size=rows.batch_size,
+        )
+
+    def actor(self) -> TensorDictModuleBase:
+        """What TorchRL's BCLoss trains: :meth:`look`'s entries -> "twist" [B, chunk, 6] (and "discrepancy" [B, 1])."""
+        outputs: list[Key] = ["loc", "scale"] if self.options.head == "gaussian" else ["twist"]
+        if self.options.discrepancy:
+            outputs.append("discrepancy")
+        module = TensorDictModule(self.network, in_keys=list(INPUTS), out_keys=outputs)
+        if self.options.head == "deterministic":
+            return module
+        draw = ProbabilisticTensorDictModule(
+            in_keys=["loc", "scale"],
+            out_keys=["twist"],
+            distribution_class=_ChunkNormal,
+            default_interaction_type=InteractionType.DETERMINISTIC,
+        )
+        return ProbabilisticTensorDictSequential(module, draw)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, and what it remembers and plans."""
+        inputs, obs = self.look(tensordict), tensordict["observation"]
+        outputs = self.network(*(inputs[key] for key in INPUTS))
+        plan_now = outputs[0] if isinstance(outputs, tuple) else outputs
+        twist, execute = plan_now[:, 0], self.options.execute
+        if execute > 1:
+            planned, plan = tensordict["learner", "planned"], tensordict["learner", "plan"]
+            goes_on = (planned > 0)[..., None]
+            whole = torch.cat([plan, torch.zeros_like(plan[:, :1])], dim=1)
+            whole = torch.where(goes_on, whole, plan_now[:, :execute])
+            twist = whole[:, 0]
+            tensordict["next", "learner", "plan"] = whole[:, 1:]
+            tensordict["next", "learner", "planned"] = torch.where(planned > 0, planned - 1, execute - 1)
+        if self.options.history:
+            tensordict["next", "learner", "felt"] = inputs["felt"][:, :-1]
+        if self.options.discrepancy:
+            tensordict["learner", "discrepancy"] = outputs[-1]
+        velocity, angular = twist[:, :3] * self.limits.linear, twist[:, 3:] * self.limits.angular
+        tensordict["action"] = joint_velocities(obs, hand_axis(obs["tool_pose"]), velocity, angular, self.limits)
+        return tensordict
+
+
+class _ChunkNormal(IndependentNormal):
+    """Normal over the entries [chunk, 6] of a plan."""
+
+    def __init__(self, loc: Tensor, scale: Tensor) -> None:
+        super().__init__(loc, scale, event_dim=2)
+
+
+def feel(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:
+    """What the hand feels [..., FELT], of the contract's "observation" group."""
+    hand = hand_axis(obs["tool_pose"])
+    velocity, angular = hand_velocities(obs, hand, obs["qvel"])
+    force = (obs["contact_force"] / FULL_FORCE).clamp(max=1.0)
+    height = obs["tool_pose"][..., 2:3]
+    return torch.cat(
+        [hand, velocity / limits.linear, angular / limits.angular, obs["attached"].to(force.dtype), force, height],
+        dim=-1,
+    )
+
+
+def twist_of(obs: TensorDictBase, action: Tensor, limits: VelocityLimits) -> Tensor:
+    """The twist [..., 6] that an action [..., 8] is: the learner's label of the expert's action."""
+    scale = torch.tensor([limits.linear] * 3 + [limits.angular] * 3 + [0.0] * 2, dtype=action.dtype)
+    velocity, angular = hand_velocities(obs, hand_axis(obs["tool_pose"]), action * scale.to(action.device))
+    return torch.cat([velocity / limits.linear, angular / limits.angular], dim=-1)
+
+
+def turned(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Tensor) -> tuple[TensorDict, Tensor]:
+    """The same situation in a scene that is turned about z and, where ``mirrored``, reflected in the plane y = 0 before.
+
+    Points, flow, axes and velocities are vectors; a turning is an axial one, which a reflection also reverses.
+
+    Args:
+        inputs: :meth:`Learner.look`'s entries [B].
+        twist: [B, chunk, 6].
+        rotation: [B] rad.
+        mirrored: [B] bool.
+    """
+    cos, sin, flip = rotation.cos(), rotation.sin(), torch.where(mirrored, -1.0, 1.0)
+    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+    matrix = torch.stack([cos, -sin * flip, zero, sin, cos * flip, zero, zero, zero, one], -1).view(-1, 3, 3)
+
+    def turn(vectors: Tensor) -> Tensor:  # [B, K, 3]
+        return vectors @ matrix.mT
+
+    def turn_pair(pair: Tensor) -> Tensor:  # [B, K, 6]: a velocity and a turning
+        return torch.cat([turn(pair[..., :3]), turn(pair[..., 3:]) * flip[:, None, None]], dim=-1)
+
+    features, felt = inputs["features"], inputs["felt"]
+    if features.shape[-1] > 1:
+        features = torch.cat([features[..., :1], turn(features[..., 1:])], dim=-1)
+    felt = torch.cat([turn(felt[..., :3]), turn_pair(felt[..., 3:9]), felt[..., 9:]], dim=-1)
+    points = turn(inputs["points"])
+    result = TensorDict(
+        {"points": points, "features": features, "valid": inputs["valid"], "felt": felt}, inputs.batch_size
+    )
+    return result, turn_pair(twist)
