@@ -9,9 +9,11 @@ of TorchRL can load it as well.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.data import LazyMemmapStorage, RoundRobinWriter, TensorDictReplayBuffer
 
+from fb3d_rl import contract
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import Key, UserError
 
@@ -42,7 +45,7 @@ class EpisodeInfo:
         seed: of the random draws within the episode.
         round: of DAgger, 0 for demonstrations.
         success: the part was open at the end.
-        normalized_distance: |q_goal - q| / |q_goal - q_start| at the end.
+        normalized_distance: |q_goal - q| / |q_goal - q_start| at the end; NaN if it is not known.
         steps: control steps that the episode took.
         rows: how many of these, from the first one on, are kept; the buffer says so itself.
     """
@@ -235,10 +238,9 @@ class DemonstrationBuffer:
         if not chosen:
             raise UserError(f"none of the {len(self._episodes)} episodes of {self.path} is kept; ask for less")
         rows = sum(self._episodes[episode].rows for episode in chosen)
-        copy = DemonstrationBuffer.create(path, rows, {**self.about, **(about or {})})
-        for episode in chosen:
-            copy.extend(self.frames(episode), self._episodes[episode])
-        copy.commit()
+        with new_buffer(path, rows, {**self.about, **(about or {})}) as copy:
+            for episode in chosen:
+                copy.extend(self.frames(episode), self._episodes[episode])
         return copy
 
     def _load(self) -> None:
@@ -255,6 +257,50 @@ class DemonstrationBuffer:
                 shutil.rmtree(entry)
             elif entry.name != TABLE:
                 entry.unlink()
+
+
+@contextmanager
+def new_buffer(path: Path | str, capacity: int, about: Mapping[str, Any]) -> Iterator[DemonstrationBuffer]:
+    """A new buffer that is committed in the end; an error leaves nothing of it behind.
+
+    Raises:
+        UserError: there is something at ``path``.
+    """
+    buffer = DemonstrationBuffer.create(path, capacity, about)
+    try:
+        yield buffer
+        buffer.commit()
+    except BaseException:
+        shutil.rmtree(buffer.path)
+        raise
+
+
+def demonstrated(frames: TensorDictBase) -> TensorDictBase:
+    """Frames [T] of data from elsewhere with the keys that they lack: who acted was the expert, in every step.
+
+    Raises:
+        UserError: the observation or the action is not what the data contract says.
+    """
+    try:
+        contract.check(frames, "observation")
+        contract.check(frames, "action")
+    except ValueError as error:
+        raise UserError(f"the data do not fit the task: {error}") from error
+    steps = len(frames)
+    labels: dict[Key, Tensor] = {
+        ("expert", "action"): frames["action"],
+        ("expert", "acts"): torch.ones(steps, 1, dtype=torch.bool),
+        "elapsed_steps": torch.arange(steps, dtype=torch.int32)[:, None],
+    }
+    for key, value in labels.items():
+        if key not in frames.keys(include_nested=True):
+            frames[key] = value
+    return frames
+
+
+def stranger(category: str, success: bool, steps: int, seed: int = 0) -> EpisodeInfo:
+    """What there is to say about an episode from elsewhere, of which neither object nor start are known."""
+    return EpisodeInfo("unknown", category, -1, (), View(0.0, 0.0), seed, 0, success, math.nan, steps)
 
 
 def _layout(rows: TensorDictBase) -> dict[Key, tuple[torch.Size, torch.dtype]]:
