@@ -73,7 +73,7 @@ def test_maniskills_own_loader_reads_them(tmp_path: Path, buffer: DemonstrationB
     assert np.array_equal(loaded.actions, rows["action"])
     ends = np.zeros(len(buffer), dtype=bool)
     ends[8] = True  # the second episode was cut, the third failed
-    assert np.array_equal(np.concatenate(loaded.success), ends) and np.array_equal(loaded.terminated, ends)
+    assert np.array_equal(loaded.success, ends) and np.array_equal(loaded.terminated, ends)
     assert np.flatnonzero(loaded.truncated).tolist() == [19]
     assert [episode["elapsed_steps"] for episode in loaded.episodes] == list(LENGTHS)
     only = dataset.ManiSkillTrajectoryDataset(str(tmp_path / "x.h5"), success_only=True)
