@@ -1,0 +1,180 @@
+"""Demonstrations in other people's formats: they come back in every bit, and strangers' files can be read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+
+from fb3d_rl.camera.views import View
+from fb3d_rl.contract import UserError, spec
+from fb3d_rl.data import lerobot, maniskill
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
+
+POINTS = 6
+INFO = EpisodeInfo("a/1", "Oven", 2, (0.1, -0.2), View(12.5, 1 / 3), 2**40, 1, True, 0.05, 9)
+LENGTHS = (9, 4, 7)
+
+
+def frames(steps: int, seed: int) -> TensorDict:
+    rng = torch.Generator().manual_seed(seed)
+    td = TensorDict({}, batch_size=[steps])
+    for group in ("observation", "privileged", "action"):
+        for key, entry in spec(group).items():
+            shape = [POINTS if size == "N" else int(size) for size in entry.shape]
+            value = torch.randn(steps, *shape, generator=rng)
+            td[key] = value > 0 if entry.dtype is torch.bool else value
+    td["expert", "action"] = torch.randn(steps, 8, generator=rng)
+    td["expert", "acts"] = torch.rand(steps, 1, generator=rng) > 0.5
+    td["elapsed_steps"] = torch.arange(steps, dtype=torch.int32)[:, None]
+    td["action"][0, 0] = -0.0  # equal to 0, but of other bits
+    return td
+
+
+@pytest.fixture
+def buffer(tmp_path: Path) -> DemonstrationBuffer:
+    """An episode that succeeded, one that was cut, one that failed, in another category."""
+    buffer = DemonstrationBuffer.create(tmp_path / "made", 50, {"seed": 3, "env_info": {"env_id": "E"}})
+    infos = (INFO, replace(INFO, seed=1), replace(INFO, seed=2, category="Box", success=False, steps=7))
+    for k, (steps, info) in enumerate(zip(LENGTHS, infos, strict=True)):
+        buffer.extend(frames(steps, k), info)
+    buffer.commit()
+    return buffer
+
+
+def same(a: DemonstrationBuffer, b: DemonstrationBuffer) -> bool:
+    first, second = a[range(len(a))], b[range(len(b))]
+    return (
+        (a.episodes, a.about, a.keys) == (b.episodes, b.about, b.keys)
+        and a.keys != {}
+        and all(first[key].numpy().tobytes() == second[key].numpy().tobytes() for key in a.keys)
+    )
+
+
+def test_maniskills_files_come_back_in_every_bit(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    maniskill.write(buffer, tmp_path / "x.h5")
+    assert same(buffer, maniskill.read(tmp_path / "x.h5", tmp_path / "again"))
+    assert same(buffer, DemonstrationBuffer.open(tmp_path / "again"))
+    assert {path.name for path in tmp_path.iterdir()} == {"made", "again", "x.h5", "x.json"}
+
+
+def test_maniskills_own_loader_reads_them(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    dataset = pytest.importorskip("mani_skill.trajectory.dataset")
+    maniskill.write(buffer, tmp_path / "x.h5")
+    loaded = dataset.ManiSkillTrajectoryDataset(str(tmp_path / "x.h5"))
+    rows = buffer[range(len(buffer))]
+    assert len(loaded) == len(buffer)
+    assert np.array_equal(loaded.obs["observation"]["points"], rows["observation", "points"])
+    assert np.array_equal(loaded.actions, rows["action"])
+    ends = np.zeros(len(buffer), dtype=bool)
+    ends[8] = True  # the second episode was cut, the third failed
+    assert np.array_equal(loaded.success, ends) and np.array_equal(loaded.terminated, ends)
+    assert np.flatnonzero(loaded.truncated).tolist() == [19]
+    assert [episode["elapsed_steps"] for episode in loaded.episodes] == list(LENGTHS)
+    only = dataset.ManiSkillTrajectoryDataset(str(tmp_path / "x.h5"), success_only=True)
+    assert len(only) == 13
+
+
+def test_lerobots_data_set_comes_back_in_every_bit(
+    tmp_path: Path, buffer: DemonstrationBuffer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pyarrow")
+    for name, megabytes in (("one", 100), ("many", 0)):
+        monkeypatch.setattr(lerobot, "FILE_MB", megabytes)
+        lerobot.write(buffer, tmp_path / name, rate=20)
+        assert len(list((tmp_path / name / "data").rglob("*.parquet"))) == (1 if megabytes else 3)
+        assert same(buffer, lerobot.read(tmp_path / name, tmp_path / f"{name} again"))
+
+
+def test_lerobots_data_set_says_what_lerobot_asks_for(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    lerobot.write(buffer, tmp_path / "x", rate=20)
+    info = json.loads((tmp_path / "x/meta/info.json").read_text())
+    assert info["features"]["observation.points"] == {"dtype": "float32", "shape": [POINTS, 3], "names": None}
+    assert (info["total_episodes"], info["total_frames"], info["fps"]) == (3, 20, 20)
+    table = parquet.read_table(tmp_path / "x" / info["data_path"].format(chunk_index=0, file_index=0))
+    assert table.num_rows == 20 and set(table.column_names) == set(info["features"])
+    assert table["index"].to_pylist() == list(range(20))
+    assert table["frame_index"].to_pylist() == [t for steps in LENGTHS for t in range(steps)]
+    assert table["timestamp"].to_pylist()[:3] == pytest.approx([0, 0.05, 0.1])
+    assert table["task_index"].to_pylist() == [0] * 13 + [1] * 7
+    episodes = parquet.read_table(tmp_path / "x/meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert [(e["dataset_from_index"], e["dataset_to_index"], e["length"]) for e in episodes] == [
+        (0, 9, 9), (9, 13, 4), (13, 20, 7),
+    ]  # fmt: skip
+    stats = json.loads((tmp_path / "x/meta/stats.json").read_text())
+    points = buffer[range(20)]["observation", "points"].double()
+    for name, value in {
+        "mean": points.mean(0), "std": points.std(0, correction=0), "min": points.amin(0), "max": points.amax(0),
+    }.items():  # fmt: skip
+        assert np.allclose(stats["observation.points"][name], value, atol=1e-12), name
+    assert stats["action"]["count"] == [20]
+
+
+def test_strangers_data_become_the_experts(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    """As RecordEpisode and LeRobot write it: no labels, and nothing about trials."""
+    import h5py
+
+    maniskill.write(buffer, tmp_path / "x.h5")
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        for group in file.values():
+            del group[maniskill.OWN]
+    about = json.loads((tmp_path / "x.json").read_text())
+    for entry in (about, *about["episodes"]):
+        del entry[maniskill.OWN]
+    (tmp_path / "x.json").write_text(json.dumps(about))
+    read = [maniskill.read(tmp_path / "x.h5", tmp_path / "from h5")]
+    if pytest.importorskip("pyarrow"):
+        lerobot.write(buffer, tmp_path / "y", rate=20)
+        (tmp_path / "y" / lerobot.ABOUT).unlink()
+        read.append(lerobot.read(tmp_path / "y", tmp_path / "from lerobot"))
+    for strange in read:
+        assert [info.rows for info in strange.episodes] == list(LENGTHS)
+        assert all(info.start == () for info in strange.episodes)
+        assert torch.equal(strange[range(20)]["action"], buffer[range(20)]["action"])
+    rows = read[0][range(20)]
+    assert torch.equal(rows["expert", "action"], rows["action"]) and bool(rows["expert", "acts"].all())
+    assert rows["elapsed_steps"].flatten().tolist() == [t for steps in LENGTHS for t in range(steps)]
+    assert {key: read[0].keys[key] for key in buffer.keys} == buffer.keys, "trained on together with our own"
+    assert [info.success for info in read[0].episodes] == [True, False, False]
+
+
+def test_whatever_is_wrong_is_one_sentence_and_leaves_nothing(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    import h5py
+
+    pytest.importorskip("pyarrow")
+    maniskill.write(buffer, tmp_path / "x.h5")
+    lerobot.write(buffer, tmp_path / "y", rate=20)
+    for writes in (
+        lambda: maniskill.write(buffer, tmp_path / "x.h5"),
+        lambda: lerobot.write(buffer, tmp_path / "y", 20),
+    ):
+        with pytest.raises(UserError, match="exists already"):
+            writes()
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match="cannot be read"):
+        maniskill.read(tmp_path / "nowhere.h5", out)
+    with pytest.raises(UserError, match="cannot be read"):
+        lerobot.read(tmp_path / "nowhere", out)
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        del file["traj_2/obs/observation/points"]
+    with pytest.raises(UserError, match="points"):
+        maniskill.read(tmp_path / "x.h5", out)
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        del file["traj_0/obs"]
+        file["traj_0/obs"] = np.zeros((10, 3))
+    with pytest.raises(UserError, match="flat"):
+        maniskill.read(tmp_path / "x.h5", out)
+    (tmp_path / "x.h5").write_bytes(b"no")
+    with pytest.raises(UserError, match="cannot be read"):
+        maniskill.read(tmp_path / "x.h5", out)
+    about = tmp_path / "y" / "meta" / "info.json"
+    about.write_text(about.read_text().replace("v3.0", "v2.1"))
+    with pytest.raises(UserError, match=r"v2\.1; convert"):
+        lerobot.read(tmp_path / "y", out)
+    assert not out.exists()
