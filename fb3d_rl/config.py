@@ -72,13 +72,19 @@ class CameraConfig:
 
 @dataclass
 class AlgoConfig:
+    """What is trained; ``name`` chooses the kind."""
+
+    name: str
+
+
+@dataclass
+class ArtFlowNetConfig(AlgoConfig):
     """fb3d_rl.training.fit.FitOptions and the network's arguments.
 
     Attributes:
         epochs: how often each training sample is drawn; with the batch size it gives the number of steps.
     """
 
-    name: str
     epochs: float
     batch_size: int
     lr: float
@@ -92,6 +98,91 @@ class AlgoConfig:
     checkpoint_every: int | None
     neighbors: int
     part_mask_input: bool
+
+
+@dataclass
+class BetaConfig:
+    """The share of steps that the expert makes in a round (fb3d_rl.training.schedules.beta); in the first it is 1.
+
+    Attributes:
+        mixing: "step" draws who acts for every step, "episode" once for an episode.
+    """
+
+    schedule: str
+    value: float
+    rounds: int
+    base: float
+    mixing: str
+
+
+@dataclass
+class GateConfig:
+    """fb3d_rl.policies.gates.make_gate: when the expert takes over from the learner.
+
+    Attributes:
+        options: the gate's thresholds; its own defaults unless given.
+        budget: share of steps in which it may; sets the thresholds anew before every round.
+    """
+
+    name: str
+    options: dict[str, float]
+    budget: float | None
+
+
+@dataclass
+class LearnerConfig:
+    """fb3d_rl.policies.learner.LearnerOptions."""
+
+    encoder: str
+    head: str
+    flow: str
+    points: int
+    width: int
+    history: int
+    chunk: int
+    execute: int
+
+
+@dataclass
+class ImitationConfig(AlgoConfig):
+    """Behaviour cloning and DAgger.
+
+    Attributes:
+        rounds: how often is collected and fitted.
+        labels: steps that the expert labels, in all rounds.
+        steps: optimizer steps in all rounds; each fit has its share of them.
+        oracle: whether the expert drives to the contact point and the learner acts on held parts alone.
+        members: learners of an ensemble.
+        flow_checkpoint: an ArtFlowNet's checkpoint.pt, for ``learner.flow=artflownet``.
+        demonstrations: a buffer that launch/demos.py recorded, imported or filtered, to start from.
+        overlap: collect each next round while the last one is fitted, with the weights from before.
+        validate_trials: held-out trials after each round, for the learning curve.
+        loss: of a deterministic head: "l1", "l2" or "smooth_l1"; the Gaussian's is its likelihood.
+        turn: situations are turned about z by up to so many degrees.
+        mirror: every other situation is mirrored, at random.
+    """
+
+    rounds: int
+    labels: int
+    steps: int
+    beta: BetaConfig
+    gate: GateConfig
+    oracle: bool
+    members: int
+    learner: LearnerConfig
+    flow_checkpoint: str | None
+    demonstrations: str | None
+    overlap: bool
+    validate_trials: int
+    batch_size: int
+    lr: float
+    schedule: str
+    clip_norm: float | None
+    loss: str
+    turn: float
+    mirror: bool
+    log_every: int
+    checkpoint_every: int | None
 
 
 @dataclass
@@ -238,7 +329,7 @@ def validate(cfg: CommandConfig) -> None:
         UserError: names the first key that is wrong and what it may be.
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
-    _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+    _one_of("policy.name", cfg.policy.name, ("expert", "artflownet", "bc", "dagger"))
     _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
     _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
     _at_least("collector.restarts", cfg.collector.restarts, 0)
@@ -247,20 +338,15 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
-        _one_of("algo.name", cfg.algo.name, ("artflownet",))
-        _one_of("policy.name", cfg.policy.name, ("artflownet",))
-        _one_of("algo.schedule", cfg.algo.schedule, ("constant", "one_cycle"))
-        for key in ("batch_size", "log_every", "neighbors"):
-            _at_least(f"algo.{key}", getattr(cfg.algo, key), 1)
-        if not 0 <= cfg.algo.scale < 1:
-            raise UserError(f"algo.scale={cfg.algo.scale} is out of range; give a number from 0 to below 1")
-        for key in ("epochs", "lr"):
-            if getattr(cfg.algo, key) <= 0:
-                raise UserError(f"algo.{key}={getattr(cfg.algo, key)} must be greater than 0")
+        _one_of("algo.name", cfg.algo.name, ("artflownet", "bc", "dagger"))
+        if isinstance(cfg.algo, ArtFlowNetConfig):
+            _validate_artflownet(cfg.algo)
+        elif isinstance(cfg.algo, ImitationConfig):
+            _validate_imitation(cfg.algo, cfg.collector)
         _at_least("data.train_samples", cfg.data.train_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
-    if isinstance(cfg, EvaluateConfig) and cfg.policy.name == "artflownet" and not cfg.checkpoint:
-        raise UserError("policy=artflownet needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
+    if isinstance(cfg, EvaluateConfig) and cfg.policy.name != "expert" and not cfg.checkpoint:
+        raise UserError(f"policy={cfg.policy.name} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
     _at_least("seed", cfg.seed, 0)
     _at_least("data.points", cfg.data.points, 64)
     _at_least("data.eval_samples", cfg.data.eval_samples, 1)
@@ -293,6 +379,55 @@ def validate(cfg: CommandConfig) -> None:
             )
         if not os.path.isdir(cfg.assets.root):
             raise UserError(f"assets.root={cfg.assets.root} is no folder; give the one that holds <id>/mobility.urdf")
+
+
+def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
+    _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
+    for key in ("batch_size", "log_every", "neighbors"):
+        _at_least(f"algo.{key}", getattr(algo, key), 1)
+    if not 0 <= algo.scale < 1:
+        raise UserError(f"algo.scale={algo.scale} is out of range; give a number from 0 to below 1")
+    for key in ("epochs", "lr"):
+        _positive(f"algo.{key}", getattr(algo, key))
+
+
+def _validate_imitation(algo: ImitationConfig, collector: CollectorConfig) -> None:
+    _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
+    _one_of("algo.loss", algo.loss, ("l1", "l2", "smooth_l1"))
+    _one_of("algo.beta.schedule", algo.beta.schedule, ("constant", "linear", "exponential", "first"))
+    _one_of("algo.beta.mixing", algo.beta.mixing, ("step", "episode"))
+    _one_of("algo.gate.name", algo.gate.name, ("beta", "safe", "ensemble", "lazy", "thrifty"))
+    for key in ("rounds", "members", "batch_size", "log_every"):
+        _at_least(f"algo.{key}", getattr(algo, key), 1)
+    for key in ("labels", "steps"):
+        if getattr(algo, key) < algo.rounds:
+            raise UserError(f"algo.{key}={getattr(algo, key)} is less than one for each of algo.rounds={algo.rounds}")
+    _at_least("algo.validate_trials", algo.validate_trials, 0)
+    _at_least("algo.turn", algo.turn, 0)
+    _positive("algo.lr", algo.lr)
+    for key in ("value", "base"):
+        if not 0 <= getattr(algo.beta, key) <= 1:
+            raise UserError(f"algo.beta.{key}={getattr(algo.beta, key)} is no share; give a number from 0 to 1")
+    budget = algo.gate.budget
+    if budget is not None and algo.gate.name not in ("safe", "lazy", "thrifty"):
+        raise UserError(f"algo.gate.budget={budget} sets nothing of algo.gate.name={algo.gate.name}; leave it null")
+    if budget is not None and not 0 <= budget <= 1:
+        raise UserError(f"algo.gate.budget={budget} is no share; give a number from 0 to 1")
+    if algo.gate.name in ("ensemble", "thrifty") and algo.members < 2:
+        raise UserError(f"algo.gate.name={algo.gate.name} compares learners; give algo.members=2 or more")
+    if algo.learner.head == "gaussian" and algo.learner.chunk > 1:
+        raise UserError("algo.learner.head=gaussian has a likelihood for algo.learner.chunk=1 only")
+    if (algo.learner.flow == "artflownet") != bool(algo.flow_checkpoint):
+        raise UserError(
+            "algo.learner.flow=artflownet and algo.flow_checkpoint=PATH, a checkpoint of algo=artflownet, go together"
+        )
+    if algo.overlap and collector.backend == "direct":
+        raise UserError("algo.overlap=true collects beside the fit; choose collector=process or collector=ray")
+
+
+def _positive(key: str, value: float) -> None:
+    if value <= 0:
+        raise UserError(f"{key}={value} must be greater than 0")
 
 
 def _one_of(key: str, value: str, choices: tuple[str, ...]) -> None:

@@ -19,11 +19,13 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 from fb3d_rl.contract import UserError
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig]] = {"train": TrainConfig, "evaluate": EvaluateConfig}
+
+ALGOS = {"artflownet": ArtFlowNetConfig, "imitation": ImitationConfig}
 
 
 def main(name: str, task: Callable[[Any, Path], Any]) -> None:
@@ -32,6 +34,8 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
     Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend.
     """
     ConfigStore.instance().store(name=f"{name}_schema", node=SCHEMAS[name])
+    for kind, node in ALGOS.items():
+        ConfigStore.instance().store(group="algo", name=f"{kind}_schema", node=node)
 
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:

@@ -1,4 +1,4 @@
-"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet [checkpoint=PATH] [assets=...] ...``."""
+"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet|bc|dagger [checkpoint=PATH] [assets=...] ...``."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from command import main
 
 def task(cfg: Any, out: Path) -> None:
     """Evaluate the configured policy; the imports take seconds, so they come after the configuration's checks."""
-    from fb3d_rl.algos.artflownet import run_evaluation
+    from fb3d_rl.algos import artflownet, dagger
 
-    run_evaluation(cfg, out)
+    (dagger if cfg.policy.name in dagger.ALGOS else artflownet).run_evaluation(cfg, out)
 
 
 if __name__ == "__main__":

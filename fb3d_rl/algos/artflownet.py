@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -25,7 +25,7 @@ from fb3d_rl.training.fit import FitOptions, fit
 from fb3d_rl.training.run_log import RunLog
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import EvaluateConfig, TrainConfig
+    from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, TrainConfig
 
 CHECKPOINT = "checkpoint.pt"
 
@@ -62,7 +62,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
     validation, _ = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
 
-    kwargs = {"part_mask_input": cfg.algo.part_mask_input, "neighbors": cfg.algo.neighbors}
+    algo = cast("ArtFlowNetConfig", cfg.algo)
+    kwargs = {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors}
     net = new_network(cfg.seed, **kwargs)
 
     def validate() -> dict[str, float]:
@@ -85,7 +86,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
     """How ArtFlowNet is fitted."""
-    algo = cfg.algo
+    algo = cast("ArtFlowNetConfig", cfg.algo)
     return FitOptions(
         steps=math.ceil(algo.epochs * cfg.data.train_samples / algo.batch_size),
         batch_size=algo.batch_size,

@@ -16,7 +16,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.views import View
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.evaluation.rollout import policy_env
+from fb3d_rl.evaluation.rollout import policy_env, state_of
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
@@ -78,7 +78,7 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
         options: the task's constants.
     """
     base = make_env([obj], options, [trial])
-    env, task = policy_env(base), cast("OpenArticulatedEnv", base.env)
+    env, task = policy_env(base, state_of(policy)), cast("OpenArticulatedEnv", base.env)
     poses, frames = [], []
     try:
         with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():

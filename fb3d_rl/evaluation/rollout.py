@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
+import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data.tensor_specs import Composite, Unbounded
@@ -30,15 +31,25 @@ KEYS: tuple[Key, ...] = (
 """What a row is made of."""
 
 
-def policy_env(env: EnvBase, policy: TensorDictModuleBase | None = None) -> EnvBase:
-    """``env`` with the policy's state in its TensorDicts, set to 0 at every reset.
+def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
+    """What travels in the TensorDicts [1] of an episode at its start, all 0.
 
-    That is the flow policy's state, and what else ``policy.initial_state`` lays out.
+    That is the flow policy's state below "policy", and what else ``policy.initial_state`` lays out.
     """
-    start = TensorDict({"policy": FlowPolicy.initial_state(env.batch_size)}, batch_size=env.batch_size)
+    one = torch.Size([1])
+    start = TensorDict({"policy": FlowPolicy.initial_state(one)}, batch_size=one)
     further = None if isinstance(policy, FlowPolicy) else getattr(policy, "initial_state", None)
-    if further is not None:
-        start.update(further(env.batch_size))
+    return start if further is None else start.update(further(one))
+
+
+def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
+    """``env`` with a policy's state in its TensorDicts, set to 0 at every reset.
+
+    Args:
+        env: the environment.
+        state: as :func:`state_of` gives it; the flow policy's alone unless given.
+    """
+    start = (state_of() if state is None else state).expand(env.batch_size)
     return TransformedEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
 
 
@@ -77,7 +88,7 @@ def run_trials(
         One row per trial, in the order of ``scheduled``.
     """
     rows: dict[int, TrialRow] = {}
-    create = partial(_create_env, tuple(objects), options)
+    create = partial(create_env, tuple(objects), options, state_of(policy))
     with Workers(create, policy, collector or CollectorOptions(), options.horizon) as workers:
         for episode in workers.run([item.trial for item in scheduled], KEYS):
             row = _row(episode, name, scheduled[episode.index])
@@ -86,8 +97,9 @@ def run_trials(
     return [rows[i] for i in range(len(scheduled))]
 
 
-def _create_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> EnvBase:
-    return policy_env(make_env(objects, options))
+def create_env(objects: Sequence[ArticulatedObject], options: EnvOptions, state: TensorDictBase) -> EnvBase:
+    """The task for ``objects`` with a policy's state; a function that can be pickled."""
+    return policy_env(make_env(objects, options), state)
 
 
 def _row(episode: Episode, name: str, item: Scheduled) -> TrialRow:

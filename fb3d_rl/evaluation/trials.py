@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Trial, default_trial
 from fb3d_rl.perception.cloud import MIN_VISIBLE
@@ -74,3 +75,37 @@ def _visible_trial(view: ObjectView, link: int, options: SampleOptions, seed: in
         if np.isin(links, carried).sum() >= MIN_VISIBLE:
             return trial
     return None
+
+
+def draw_trials(
+    views: Sequence[ObjectView], options: SampleOptions, rng: np.random.Generator, count: int
+) -> list[Trial]:
+    """Draw trials to train on: a category, an object of it and a part of that, each with equal odds, then a view.
+
+    Args:
+        views: the objects.
+        options: points of a cloud and views.
+        rng: the named generator that draws.
+        count: number of trials.
+
+    Raises:
+        UserError: no part opens, or the camera sees too little of every one.
+    """
+    by_category: dict[str, list[ObjectView]] = {}
+    for view in views:
+        if view.openable:
+            by_category.setdefault(view.obj.category, []).append(view)
+    categories = sorted(by_category)
+    if not categories:
+        raise UserError("the objects have no part that opens; choose other objects")
+    trials: list[Trial] = []
+    for _ in range(100 * count):
+        those = by_category[categories[rng.integers(len(categories))]]
+        view = those[rng.integers(len(those))]
+        link = view.openable[rng.integers(len(view.openable))]
+        trial = _visible_trial(view, link, options, int(rng.integers(2**31)))
+        if trial is not None:
+            trials.append(trial)
+        if len(trials) == count:
+            return trials
+    raise UserError("the camera sees too little of the parts that open; choose other objects or views")

@@ -34,6 +34,7 @@ class ArtFlowNet(nn.Module):
     ) -> None:
         super().__init__()
         self.part_mask_input = part_mask_input
+        self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors}
         self.network = PointNet2(inputs=int(part_mask_input), outputs=3, neighbors=neighbors)
         if generator is not None:
             initialize(self.network, generator)

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from fb3d_rl.contract import Key, UserError
+from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
@@ -134,13 +135,18 @@ class Learner(TensorDictModuleBase):
         options: the network.
         limits: what action 1 means.
         generator: draws the first weights; None leaves them to torch's global generator.
+        flow_net: an ArtFlowNet to predict the flow with, for the option flow="artflownet"; it is not trained.
 
     Shapes: reads the contract's observation [E, ...]; writes "action" [E, 8] and, if asked for, ("learner",
     "discrepancy") [E, 1]. Its memory and its plan travel below "learner", see :meth:`initial_state`.
     """
 
     def __init__(
-        self, options: LearnerOptions, limits: VelocityLimits, generator: torch.Generator | None = None
+        self,
+        options: LearnerOptions,
+        limits: VelocityLimits,
+        generator: torch.Generator | None = None,
+        flow_net: ArtFlowNet | None = None,
     ) -> None:
         super().__init__()
         self.options, self.limits = options, limits
@@ -149,10 +155,17 @@ class Learner(TensorDictModuleBase):
         self.network = TwistNetwork(options)
         if generator is not None:
             initialize(self.network, generator)
-        self.in_keys = [*SEEN, *([flow] if flow else ()), *(("learner", key) for key in self._state())]
+        if (flow_net is not None) != (options.flow == "artflownet"):
+            raise ValueError('flow="artflownet" needs a flow network, and nothing else does')
+        self.flow_network = None if flow_net is None else flow_net.requires_grad_(False).eval()
+        self._predict = None if flow_net is None else artflownet_module(flow_net)
+        given = [flow] if flow and flow_net is None else []
+        self.in_keys = [*SEEN, *given, *(("learner", key) for key in self._state())]
         self.out_keys = ["action", *(("next", "learner", key) for key in self._state())]
         if options.discrepancy:
             self.out_keys.append(("learner", "discrepancy"))
+        if flow_net is not None:
+            self.out_keys.append(("prediction", "flow"))
 
     def _state(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
         state: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
@@ -188,6 +201,13 @@ class Learner(TensorDictModuleBase):
             batch_size=rows.batch_size,
         )
 
+    def train(self, mode: bool = True) -> Learner:
+        """As every module's, but a flow network stays as it is."""
+        super().train(mode)
+        if self.flow_network is not None:
+            self.flow_network.eval()
+        return self
+
     def actor(self) -> TensorDictModuleBase:
         """What TorchRL's BCLoss trains: :meth:`look`'s entries -> "twist" [B, chunk, 6] (and "discrepancy" [B, 1])."""
         outputs: list[Key] = ["loc", "scale"] if self.options.head == "gaussian" else ["twist"]
@@ -207,6 +227,8 @@ class Learner(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action, and what it remembers and plans."""
+        if self._predict is not None:
+            self._predict(tensordict)
         inputs, obs = self.look(tensordict), tensordict["observation"]
         outputs = self.network(*(inputs[key] for key in INPUTS))
         plan_now = outputs[0] if isinstance(outputs, tuple) else outputs
@@ -247,6 +269,12 @@ def feel(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:
     )
 
 
+def history_of(felt: Tensor, count: int) -> Tensor:
+    """What a learner remembers at each step of an episode [T, count, FELT], the last step first, of felt [T, FELT]."""
+    padded = torch.cat([felt.new_zeros(count, felt.shape[-1]), felt])
+    return torch.stack([padded[count - k : len(padded) - k] for k in range(1, count + 1)], dim=1)
+
+
 def twist_of(obs: TensorDictBase, action: Tensor, limits: VelocityLimits) -> Tensor:
     """The twist [..., 6] that an action [..., 8] is: the learner's label of the expert's action."""
     scale = torch.tensor([limits.linear] * 3 + [limits.angular] * 3 + [0.0] * 2, dtype=action.dtype)
@@ -255,7 +283,7 @@ def twist_of(obs: TensorDictBase, action: Tensor, limits: VelocityLimits) -> Ten
 
 
 def turned(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Tensor) -> tuple[TensorDict, Tensor]:
-    """The same situation in a scene that is turned about z and, where ``mirrored``, reflected in the plane y = 0 before.
+    """The same situation in a scene that is reflected in the plane y = 0 where ``mirrored``, then turned about z.
 
     Points, flow, axes and velocities are vectors; a turning is an axial one, which a reflection also reverses.
 

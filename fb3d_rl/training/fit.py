@@ -16,18 +16,26 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 from torch import Tensor, nn
-from torchrl.data import ReplayBuffer
 
 from fb3d_rl.contract import UserError
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
 """The loss of a batch of rows [B] in step number k, a scalar."""
+
+
+class Rows(Protocol):
+    """What is drawn from: a TensorDict [R], TorchRL's replay buffer, or what else gives rows by their number."""
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, index: Any, /) -> Any: ...
+
 
 SCHEDULES = ("constant", "one_cycle")
 
@@ -190,7 +198,7 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 
 def fit(
     model: nn.Module,
-    buffer: ReplayBuffer | TensorDictBase,
+    buffer: Rows,
     options: FitOptions,
     *,
     objective: Objective | None = None,
@@ -200,6 +208,7 @@ def fit(
     on_checkpoint: Callable[[dict[str, Any]], None] | None = None,
     resume: dict[str, Any] | None = None,
     progress: bool = True,
+    title: str = "training",
 ) -> dict[str, Any]:
     """Train a network.
 
@@ -217,6 +226,7 @@ def fit(
         on_checkpoint: receives the state to resume from; also called at the end and on Ctrl-C.
         resume: such a state.
         progress: show a progress bar.
+        title: of the progress bar.
 
     Returns:
         The last state: {"step", "model", "optimizer", "loss_sum", "loss_count", "options"}.
@@ -267,10 +277,10 @@ def fit(
         return step == options.steps or (every is not None and step % every == 0)
 
     columns = (
-        TextColumn("training"),
+        TextColumn(title),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.0f} clouds/s  left"),
+        TextColumn("loss {task.fields[loss]:.4f}  {task.fields[rate]:.0f} rows/s  left"),
         TimeRemainingColumn(),
     )
     started, first = time.perf_counter(), step
@@ -290,7 +300,7 @@ def fit(
                     lr = learning_rate(step - 1, options)
                     mean = loss_sum / loss_count
                     log({"step": step, "train/loss": mean, "train/lr": lr, "time/seconds": seconds,
-                         "time/clouds_per_s": rate})  # fmt: skip
+                         "time/rows_per_s": rate})  # fmt: skip
                 loss_sum, loss_count = 0.0, 0
             if due(options.evaluate_every) and evaluate is not None:
                 model.eval()

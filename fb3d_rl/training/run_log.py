@@ -21,15 +21,22 @@ class RunLog:
         out_dir: the run's folder; made if it is missing.
         resume_step: keep the rows up to this step, drop later ones, which a resumed run writes again. None
             starts an empty file.
+        resume_rows: keep this many rows instead.
+
+    Attributes:
+        rows: how many rows there are.
     """
 
-    def __init__(self, out_dir: Path | str, resume_step: int | None = None) -> None:
+    def __init__(self, out_dir: Path | str, resume_step: int | None = None, resume_rows: int | None = None) -> None:
         folder = Path(out_dir)
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / FILE_NAME
         kept = []
         if resume_step is not None and self.path.exists():
             kept = [row for row in read_rows(self.path) if row.get("step", 0) <= resume_step]
+        if resume_rows is not None and self.path.exists():
+            kept = read_rows(self.path)[:resume_rows]
+        self.rows = len(kept)
         temporary = self.path.with_suffix(".part")
         temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
         os.replace(temporary, self.path)
@@ -42,6 +49,7 @@ class RunLog:
         }
         self._file.write(json.dumps(plain) + "\n")
         self._file.flush()
+        self.rows += 1
 
     def close(self) -> None:
         """Close the file."""

@@ -1,0 +1,171 @@
+"""DAgger's collection: trials to train on, run by expert and learner, with the expert's label of every step."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+
+from fb3d_rl.contract import Key, UserError
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
+from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.env.options import Trial
+from fb3d_rl.env.workers import Workers
+from fb3d_rl.evaluation.trials import draw_trials
+from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
+
+STEPS_OF_TRIAL = 60
+"""Labels that a trial is reckoned to bring."""
+
+OUTCOME: tuple[Key, ...] = (("next", "success"), ("next", "contact"), ("next", "normalized_distance"))
+
+EXPERT: tuple[Key, ...] = ("action", ("expert", "action"), ("expert", "acts"), "elapsed_steps")
+"""What a row holds besides what the learner reads and writes."""
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one round collected.
+
+    Attributes:
+        episodes: frames [T] with what is known about them; exactly as many as the labels asked for.
+        numbers: of the whole episodes: "collect/success_rate", "collect/contact_rate", "collect/expert_share" ...
+    """
+
+    episodes: list[tuple[TensorDictBase, EpisodeInfo]]
+    numbers: dict[str, float]
+
+
+def collect(
+    workers: Workers,
+    views: Sequence[ObjectView],
+    samples: SampleOptions,
+    rows: RowsOptions,
+    number: int,
+    labels: int,
+    rng: np.random.Generator,
+    progress: Callable[[int], None] = lambda labels: None,
+) -> Round:
+    """Run trials until they have brought ``labels`` labels; the last episode is cut to fit.
+
+    Args:
+        workers: environments with an :class:`~fb3d_rl.policies.interaction.InteractivePolicy`.
+        views: the objects to train on.
+        samples: clouds and views.
+        rows: what a row holds.
+        number: of the round.
+        labels: labels to collect.
+        rng: draws the trials.
+        progress: called with the labels so far.
+
+    Raises:
+        UserError: every trial of a batch crashed.
+    """
+    categories = {view.obj.id: view.obj.category for view in views}
+    episodes: list[tuple[TensorDictBase, EpisodeInfo]] = []
+    outcomes: list[tuple[bool, bool, float]] = []
+    count, steps, crashed, started = 0, 0, 0, time.perf_counter()
+    while count < labels:
+        # A number that depends on the labels alone, so that the workers' number decides nothing.
+        trials = draw_trials(views, samples, rng, min(48, math.ceil((labels - count) / STEPS_OF_TRIAL)))
+        ended: dict[int, TensorDictBase] = {}
+        for episode in workers.run(trials, rows.keys()):
+            if episode.frames is None:
+                crashed, error = crashed + 1, episode.error
+                continue
+            ended[episode.index] = episode.frames
+            steps += len(episode.frames)
+            progress(min(labels, count + sum(map(len, ended.values()))))
+        if not ended:
+            raise UserError(f"all of {len(trials)} trials crashed, the last one with: {error}")
+        for index, trial in enumerate(trials):
+            if index not in ended:
+                continue
+            frames = rows.of(ended[index])
+            info = _info(trial, categories[trial.object], number, ended[index])
+            outcomes.append((info.success, bool(ended[index]["next", "contact"].any()),
+                             float(ended[index]["expert", "acts"].float().mean())))  # fmt: skip
+            if count < labels and len(frames):
+                kept = frames[: labels - count]
+                episodes.append((kept, info))
+                count += len(kept)
+    success, contact, share = np.mean(outcomes, axis=0).tolist()
+    seconds = time.perf_counter() - started
+    numbers = {
+        "collect/success_rate": success,
+        "collect/contact_rate": contact,
+        "collect/expert_share": share,
+        "collect/episodes": len(outcomes),
+        "collect/crashed": crashed,
+        "time/collect_seconds": seconds,
+        "time/labels_per_s": steps / seconds,
+    }
+    return Round(episodes, numbers)
+
+
+@dataclass(frozen=True)
+class RowsOptions:
+    """Which frames and which of their entries become rows.
+
+    Attributes:
+        limits: what action 1 means.
+        history: steps that the learner remembers.
+        flow: where it reads a flow.
+        further: what a gate's thresholds are set by.
+        attached_only: whether the learner acts on held parts only, so that the other labels are not asked for.
+    """
+
+    limits: VelocityLimits
+    history: int = 0
+    flow: Key | None = None
+    further: tuple[Key, ...] = ()
+    attached_only: bool = False
+
+    def keys(self) -> list[Key]:
+        """What the workers have to send."""
+        return [*SEEN, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
+
+    def of(self, frames: TensorDictBase) -> TensorDictBase:
+        """The rows of an episode's frames [T]: with the label as a twist, and what the learner remembers."""
+        rows = frames.select(*SEEN, *([self.flow] if self.flow else ()), *EXPERT, *self.further)
+        rows["expert", "twist"] = twist_of(rows["observation"], rows["expert", "action"], self.limits)
+        if self.history:
+            rows["learner", "felt"] = history_of(feel(rows["observation"], self.limits), self.history)
+        return rows[rows["observation", "attached"].squeeze(-1)] if self.attached_only else rows
+
+
+def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer, rows: RowsOptions) -> None:
+    """Add all of ``source``'s rows, as the learner takes them.
+
+    Raises:
+        UserError: they lack what the learner reads.
+    """
+    lacking = [key for key in (*SEEN, *([rows.flow] if rows.flow else ()), *EXPERT) if key not in source.keys]
+    if lacking:
+        raise UserError(f"the demonstrations at {source.path} lack {', '.join(map(str, lacking))}; record them anew")
+    for episode, info in enumerate(source.episodes):
+        target.extend(rows.of(source.frames(episode)), info)
+
+
+def _info(trial: Trial, category: str, number: int, frames: TensorDictBase) -> EpisodeInfo:
+    last = frames["next"][-1]
+    return EpisodeInfo(
+        trial.object, category, trial.link, trial.start, trial.view, trial.seed, number,
+        bool(last["success"]), float(last["normalized_distance"]), len(frames),
+    )  # fmt: skip
+
+
+def relabelled(rows: TensorDictBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
+    """``rows`` [R] with what the learner would do and say there now."""
+    parts = []
+    for part in rows.split(256):
+        said = policy(part.clone())
+        part["learner", "action"] = said["action"]
+        parts.append(part.update(said.select("learner")))
+    return torch.cat(parts)
