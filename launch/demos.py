@@ -15,7 +15,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells about every memory map
 
@@ -101,6 +101,7 @@ def record(options: argparse.Namespace) -> None:
         value = getattr(options, key)
         if value is not None and value < least:
             raise UserError(f"--{key} {value} is too small; give {least} or more")
+    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from fb3d_rl.data.demonstrations import DemonstrationBuffer
@@ -115,14 +116,14 @@ def record(options: argparse.Namespace) -> None:
     root = None if options.root is None else str(Path(options.root).resolve())
     assets = Assets(root, options.split, tuple(options.categories.split(",")), options.objects, options.seed)
     env = EnvOptions(points=options.points, horizon=options.horizon)
-    objects = assets.load()
     samples = SampleOptions(points=env.points, views=env.views, camera=env.camera)
-    scheduled = plan(objects, samples, options.seed, options.trials)
+    with Console().status("looking for parts that open"):
+        objects = assets.load()
+        scheduled = plan(objects, samples, options.seed, options.trials)
     about = recipe(env, assets) | {
         "command": " ".join(["python", *sys.argv]),
         "seed": options.seed,
         "git_revision": git_revision(),
-        **_for_maniskill(env.horizon),
     }
     buffer = DemonstrationBuffer.create(options.demos, len(scheduled) * env.horizon, about)
     collector = CollectorOptions("direct" if options.workers == 1 else "process", options.workers)
@@ -236,15 +237,6 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "export": export,
     "import": take_in,
 }
-
-
-def _for_maniskill(horizon: int) -> dict[str, Any]:
-    """What ManiSkill's trajectory files say about the task."""
-    from fb3d_rl.env.task import TASK
-
-    kwargs = {"obs_mode": "pointcloud", "num_envs": 1}
-    info = {"env_id": TASK, "max_episode_steps": horizon, "env_kwargs": kwargs}
-    return {"env_info": info, "control_mode": "velocity"}
 
 
 def _episode(buffer: DemonstrationBuffer, episode: int) -> int:

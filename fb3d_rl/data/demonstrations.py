@@ -8,6 +8,7 @@ of TorchRL can load it as well.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -85,7 +86,7 @@ class DemonstrationBuffer:
 
     def __init__(self, path: Path, capacity: int, about: Mapping[str, Any], episodes: Sequence[EpisodeInfo]) -> None:
         self.path, self.capacity, self.about = path, capacity, dict(about)
-        self._episodes = list(episodes)
+        self._episodes, self._ends = list(episodes), _ends(episodes)
         self._load()
 
     @classmethod
@@ -126,7 +127,7 @@ class DemonstrationBuffer:
             raise UserError(f"the demonstrations at {path} are damaged ({type(error).__name__}: {error})") from error
 
     def __len__(self) -> int:
-        return sum(info.rows for info in self._episodes)
+        return self._ends[-1]
 
     def __getitem__(self, index: Tensor | Sequence[int]) -> TensorDictBase:
         """Copies of the rows ``index`` [K], TensorDict [K].
@@ -152,7 +153,7 @@ class DemonstrationBuffer:
 
     def first_row(self, episode: int) -> int:
         """Index of the first row of an episode."""
-        return sum(info.rows for info in self._episodes[:episode])
+        return self._ends[episode]
 
     def frames(self, episode: int) -> TensorDictBase:
         """The rows of an episode, TensorDict [rows]."""
@@ -184,10 +185,13 @@ class DemonstrationBuffer:
             self._clear()
         self.replay.extend(rows, update_priority=False)
         self._episodes.append(replace(info, rows=count))
+        self._ends.append(size + count)
 
     def commit(self) -> None:
         """Make what was added outlast this process, and a failure of the machine's power."""
-        files = [file for file in self.path.rglob("*") if file.is_file() and not file.name.startswith(TABLE)]
+        # Without rows there may be files of rows that are no more.
+        below = self.path.rglob("*") if len(self) else ()
+        files = [file for file in below if file.is_file() and not file.name.startswith(TABLE)]
         for file in files:
             _sync(file)
         content = {
@@ -221,9 +225,8 @@ class DemonstrationBuffer:
             if rows:
                 kept.append(replace(info, rows=min(info.rows, rows)))
                 rows -= kept[-1].rows
-        self._episodes = kept
-        # Before anything is added: until then rows beyond the old commit's may be written over, not its own.
-        self.commit()
+        self._episodes, self._ends = kept, _ends(kept)
+        self.commit()  # now: the rows of the old commit may be written over from here on
         self._load()
 
     def filter(
@@ -306,6 +309,11 @@ def stranger(category: str, success: bool, steps: int, seed: int = 0) -> Episode
 def _layout(rows: TensorDictBase) -> dict[Key, tuple[torch.Size, torch.dtype]]:
     found = rows.keys(include_nested=True, leaves_only=True)
     return {key: (rows.get(key).shape[1:], rows.get(key).dtype) for key in found}
+
+
+def _ends(episodes: Sequence[EpisodeInfo]) -> list[int]:
+    """Row at which each episode begins, and the one after the last."""
+    return [0, *itertools.accumulate(info.rows for info in episodes)]
 
 
 def _sync(path: Path) -> None:

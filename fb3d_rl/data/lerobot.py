@@ -11,7 +11,8 @@ episodes is in ``meta/fb3d_rl.json``, which LeRobot leaves alone. So what is rea
 bit. Not carried: the buffer's capacity, and keys with a dot in their name. Statistics of single episodes, which LeRobot
 needs to merge data sets only, are left out.
 
-Data sets from elsewhere can be read if their features have the names and shapes of the data contract.
+Data sets from elsewhere can be read if their features have the names and shapes of the data contract. Their episodes
+count as successful: LeRobot has no word for it, and a demonstration that failed is not published.
 """
 
 from __future__ import annotations

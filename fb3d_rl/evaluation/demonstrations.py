@@ -160,8 +160,15 @@ def record_expert(
 
 
 def recipe(options: EnvOptions, assets: Assets) -> dict[str, Any]:
-    """What a buffer keeps in ``about`` so that its episodes can be run again."""
-    return {"env": asdict(options), "assets": asdict(assets)}
+    """What a buffer keeps in ``about`` so that its episodes can be run again, here and by ManiSkill's own tools."""
+    from fb3d_rl.env.task import TASK
+
+    env_info = {
+        "env_id": TASK,
+        "max_episode_steps": options.horizon,
+        "env_kwargs": {"obs_mode": "pointcloud", "num_envs": 1},
+    }
+    return {"env": asdict(options), "assets": asdict(assets), "env_info": env_info, "control_mode": "velocity"}
 
 
 def recorded_options(buffer: DemonstrationBuffer) -> EnvOptions:

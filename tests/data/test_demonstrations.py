@@ -129,6 +129,17 @@ def test_truncate_goes_back(tmp_path: Path, rows: int, lengths: list[int]) -> No
         assert holds(again, [3, 4, 5])
 
 
+def test_rows_written_after_going_back_are_gone_unless_committed(tmp_path: Path) -> None:
+    for rows, lengths in ((3, [3]), (0, [])):
+        path = tmp_path / str(rows)
+        fill(buffer := DemonstrationBuffer.create(path, 30), [3, 4])
+        buffer.commit()
+        buffer.truncate(rows)
+        fill(buffer, [5], first=len(lengths))
+        assert holds(buffer, [*lengths, 5])
+        assert holds(DemonstrationBuffer.open(path), lengths)
+
+
 def test_filter_copies_whole_episodes(tmp_path: Path) -> None:
     buffer = DemonstrationBuffer.create(tmp_path / "all", 30, {"seed": 3})
     fill(buffer, [3, 4, 5, 6])

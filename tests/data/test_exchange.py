@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -129,7 +131,7 @@ def test_strangers_data_become_the_experts(tmp_path: Path, buffer: Demonstration
         del entry[maniskill.OWN]
     (tmp_path / "x.json").write_text(json.dumps(about))
     read = [maniskill.read(tmp_path / "x.h5", tmp_path / "from h5")]
-    if pytest.importorskip("pyarrow"):
+    if find_spec("pyarrow"):
         lerobot.write(buffer, tmp_path / "y", rate=20)
         (tmp_path / "y" / lerobot.ABOUT).unlink()
         read.append(lerobot.read(tmp_path / "y", tmp_path / "from lerobot"))
@@ -144,23 +146,17 @@ def test_strangers_data_become_the_experts(tmp_path: Path, buffer: Demonstration
     assert [info.success for info in read[0].episodes] == [True, False, False]
 
 
-def test_whatever_is_wrong_is_one_sentence_and_leaves_nothing(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+def test_whatever_is_wrong_with_a_file_is_one_sentence_and_leaves_nothing(
+    tmp_path: Path, buffer: DemonstrationBuffer
+) -> None:
     import h5py
 
-    pytest.importorskip("pyarrow")
-    maniskill.write(buffer, tmp_path / "x.h5")
-    lerobot.write(buffer, tmp_path / "y", rate=20)
-    for writes in (
-        lambda: maniskill.write(buffer, tmp_path / "x.h5"),
-        lambda: lerobot.write(buffer, tmp_path / "y", 20),
-    ):
-        with pytest.raises(UserError, match="exists already"):
-            writes()
     out = tmp_path / "out"
     with pytest.raises(UserError, match="cannot be read"):
         maniskill.read(tmp_path / "nowhere.h5", out)
-    with pytest.raises(UserError, match="cannot be read"):
-        lerobot.read(tmp_path / "nowhere", out)
+    maniskill.write(buffer, tmp_path / "x.h5")
+    with pytest.raises(UserError, match="exists already"):
+        maniskill.write(buffer, tmp_path / "x.h5")
     with h5py.File(tmp_path / "x.h5", "a") as file:
         del file["traj_2/obs/observation/points"]
     with pytest.raises(UserError, match="points"):
@@ -173,8 +169,37 @@ def test_whatever_is_wrong_is_one_sentence_and_leaves_nothing(tmp_path: Path, bu
     (tmp_path / "x.h5").write_bytes(b"no")
     with pytest.raises(UserError, match="cannot be read"):
         maniskill.read(tmp_path / "x.h5", out)
+    assert not out.exists()
+
+
+def test_whatever_is_wrong_with_a_data_set_is_one_sentence_and_leaves_nothing(
+    tmp_path: Path, buffer: DemonstrationBuffer
+) -> None:
+    pytest.importorskip("pyarrow")
+    out = tmp_path / "out"
+    with pytest.raises(UserError, match="cannot be read"):
+        lerobot.read(tmp_path / "nowhere", out)
+    lerobot.write(buffer, tmp_path / "y", rate=20)
+    with pytest.raises(UserError, match="exists already"):
+        lerobot.write(buffer, tmp_path / "y", 20)
+    data = tmp_path / "y" / "data" / "chunk-000" / "file-000.parquet"
+    whole = data.read_bytes()
+    data.write_bytes(whole[:1000])
+    with pytest.raises(UserError, match="cannot be read"):
+        lerobot.read(tmp_path / "y", out)
+    data.write_bytes(whole)
     about = tmp_path / "y" / "meta" / "info.json"
     about.write_text(about.read_text().replace("v3.0", "v2.1"))
     with pytest.raises(UserError, match=r"v2\.1; convert"):
         lerobot.read(tmp_path / "y", out)
     assert not out.exists()
+
+
+def test_without_pyarrow_it_says_what_to_install(
+    tmp_path: Path, buffer: DemonstrationBuffer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(UserError, match="pip install pyarrow"):
+        lerobot.write(buffer, tmp_path / "y", rate=20)
+    with pytest.raises(UserError, match="pip install pyarrow"):
+        lerobot.read(tmp_path / "y", tmp_path / "out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -169,7 +170,7 @@ def test_a_trajectory_file_that_record_episode_wrote_is_read(
     """The recorded actions, recorded by ManiSkill, give the recorded rows but for what it does not know."""
     from mani_skill.utils.wrappers.record import RecordEpisode
 
-    from fb3d_rl.env.task import OpenArticulatedEnv
+    from fb3d_rl.env.task import TASK, OpenArticulatedEnv
 
     env = OpenArticulatedEnv([obj for obj, _ in objects], OPTIONS)
     recorder = RecordEpisode(env, str(tmp_path), trajectory_name="x", save_video=False, save_on_reset=False)
@@ -182,6 +183,11 @@ def test_a_trajectory_file_that_record_episode_wrote_is_read(
         recorder.flush_trajectory()
     finally:
         recorder.close()
+    maniskill.write(buffer, tmp_path / "y.h5")
+    theirs, ours = (json.loads((tmp_path / name).read_text()) for name in ("x.json", "y.json"))
+    assert theirs["episodes"][0]["control_mode"] == ours["episodes"][0]["control_mode"]
+    assert theirs["env_info"]["max_episode_steps"] == ours["env_info"]["max_episode_steps"] == OPTIONS.horizon
+    assert ours["env_info"]["env_id"] == TASK
     read = maniskill.read(tmp_path / "x.h5", tmp_path / "b")
     assert read.keys.keys() >= buffer.keys.keys()
     assert {key: read.keys[key] for key in buffer.keys} == buffer.keys
