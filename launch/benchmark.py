@@ -1,6 +1,6 @@
 """Measure throughput as ratios in one run on the same work; prints a table and writes JSON.
 
-python launch/benchmark.py                        control steps, workers, loading and a soak test, procedural objects
+python launch/benchmark.py                        control steps, labels, workers, loading, a soak test; procedural objects
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = ("steps", "workers", "loading", "soak")
+BENCHMARKS = ("steps", "labelling", "workers", "loading", "soak")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -72,6 +72,8 @@ def run(options: argparse.Namespace) -> None:
         for name in options.names or BENCHMARKS:
             if name == "steps":
                 results[name] = benchmark.step_rates(by_category[:6], env, rounds, status.update)
+            elif name == "labelling":
+                results[name] = benchmark.labelling(by_category[:6], env, rounds, status.update)
             elif name == "workers":
                 scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(), options.seed, limit=24)
                 results[name] = benchmark.worker_scaling(objects, scheduled, env, min(rounds, 3), status.update)

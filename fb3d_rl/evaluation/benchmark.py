@@ -5,25 +5,31 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import cycle
 from statistics import median
 from typing import Any
 
 import psutil
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.evaluation.rollout import CollectorOptions, policy_env, run_trials
+from fb3d_rl.env.workers import CollectorOptions, Workers
+from fb3d_rl.evaluation.rollout import policy_env, run_trials
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import Scheduled
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 
 Progress = Callable[[str], None]
 
@@ -52,11 +58,11 @@ def one_core() -> Iterator[None]:
 
 
 def expert_episodes(objects: Sequence[ArticulatedObject], options: EnvOptions) -> list[Episode]:
-    """One episode of the expert with each object."""
+    """One episode of the expert with each object; the seeds of their trials are 0, 1, ..."""
     expert = _expert(options)
     episodes = []
-    for obj in objects:
-        trial = default_trial(obj)
+    for seed, obj in enumerate(objects):
+        trial = default_trial(obj, seed=seed)
         env = policy_env(make_env([obj], options, [trial]))
         with torch.no_grad():
             frames = env.rollout(options.horizon, expert)
@@ -145,6 +151,72 @@ def _stock_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> tup
         return StockCloudEnv(objects, options), ""
     except UserError as error:
         return None, str(error)
+
+
+class Replay(TensorDictModuleBase):
+    """Takes recorded actions again: a learner that costs nothing and goes where the recording went.
+
+    Args:
+        actions: those of the trial with seed i [T, 8], for every i.
+    """
+
+    def __init__(self, actions: Sequence[Tensor]) -> None:
+        super().__init__()
+        self.actions = actions
+        self.in_keys: list[Key] = ["seed", "elapsed_steps"]
+        self.out_keys: list[Key] = ["action"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action [E, 8]."""
+        seeds, steps = tensordict["seed"].flatten().tolist(), tensordict["elapsed_steps"].flatten().tolist()
+        tensordict["action"] = torch.stack([self.actions[i][t] for i, t in zip(seeds, steps, strict=True)])
+        return tensordict
+
+
+def labelling(
+    objects: Sequence[ArticulatedObject], options: EnvOptions, rounds: int, progress: Progress
+) -> dict[str, Any]:
+    """Rows per second that a learner collects by itself, and where the expert labels each of them as DAgger does.
+
+    The learner replays the expert's actions, so that both visit the same states. It takes no time of its own: with a
+    real one the ratio is closer to 1. One core, through TorchRL's collector; the two take turns in each round, and
+    the ratio is a median over rounds. Objects are loaded before.
+    """
+    episodes = expert_episodes(objects, options)
+    steps = sum(len(episode.actions) for episode in episodes)
+    trials = [episode.trial for episode in episodes]
+    learner = Replay([episode.actions for episode in episodes])
+    policies = {"alone": learner, "labelled": InteractivePolicy(_expert(options), learner, BetaGate(0.0))}
+    keys: dict[str, list[Key]] = {"alone": ["observation"], "labelled": ["observation", ("expert", "action")]}
+    seconds: dict[str, list[float]] = {name: [] for name in policies}
+    with one_core(), ExitStack() as stack:
+        workers = {
+            name: stack.enter_context(
+                Workers(partial(_collected_env, objects, options, policy), policy, CollectorOptions(), options.horizon)
+            )
+            for name, policy in policies.items()
+        }
+        for i in range(rounds + 1):
+            progress(f"labelling, round {i} of {rounds}")
+            for name in policies:
+                start = time.perf_counter()
+                found = list(workers[name].run(trials, keys[name]))
+                seconds[name].append(time.perf_counter() - start)
+                if [len(e.frames if e.frames is not None else ()) for e in found] != [len(e.actions) for e in episodes]:
+                    raise RuntimeError("the episodes are not those that were recorded")
+    alone, labelled = (spent[1:] for spent in seconds.values())  # without the round that loads the objects
+    return {
+        "objects": [obj.id for obj in objects],
+        "rows": steps,
+        "rounds": rounds,
+        "learner alone, rows/s": steps / min(alone),
+        "labelled by the expert, rows/s": steps / min(labelled),
+        "labelled / alone": median(_ratios(alone, labelled)),
+    }
+
+
+def _collected_env(objects: Sequence[ArticulatedObject], options: EnvOptions, policy: TensorDictModuleBase) -> EnvBase:
+    return policy_env(make_env(objects, options), policy)
 
 
 def worker_scaling(

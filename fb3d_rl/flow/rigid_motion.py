@@ -24,16 +24,18 @@ def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge
     Returns:
         v [B, 3] in the unit of the flow and omega [B, 3] in that unit per m.
     """
-    weight = (weight / weight.sum(-1, keepdim=True).clamp_min(1e-9))[..., None]
-    arm = points - at[:, None]
-    weighted = weight * arm
-    mean_arm, mean_flow = weighted.sum(1), (weight * flow).sum(1)
-    spread = weighted.mT @ arm - mean_arm[..., :, None] * mean_arm[..., None, :]
-    trace = spread.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    eye = torch.eye(3, dtype=points.dtype, device=points.device)
-    momentum = torch.linalg.cross(weighted, flow).sum(1) - torch.linalg.cross(mean_arm, mean_flow)
-    omega = torch.linalg.solve((trace + ridge) * eye - spread, momentum)
-    return mean_flow - torch.linalg.cross(omega, mean_arm), omega
+    rows = torch.cat([points - at[:, None], flow, torch.ones_like(weight)[..., None]], dim=-1).double()
+    sums = rows.mT @ (weight[..., None] * rows)  # [B, 7, 7], in double since differences follow
+    total = sums[:, 6, 6, None].clamp_min(1e-9)
+    mean = sums[:, 6, :6] / total
+    covariance = sums[:, :3, :6] / total[..., None] - mean[:, :3, None] * mean[:, None]
+    spread, moment = covariance.split(3, dim=-1)
+    eye = torch.eye(3, dtype=spread.dtype, device=spread.device)
+    inertia = (spread.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] + ridge) * eye - spread
+    momentum = torch.linalg.cross(eye[None], moment).sum(1)  # the mean of arm x flow
+    omega = torch.cholesky_solve(momentum[..., None], torch.linalg.cholesky(inertia)).squeeze(-1)
+    velocity = mean[:, 3:] - torch.linalg.cross(omega, mean[:, :3])
+    return velocity.to(points), omega.to(points)
 
 
 def screw(velocity: Tensor, omega: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:

@@ -162,14 +162,15 @@ def take_rows(rows: Tensor, index: Tensor) -> Tensor:
 
 
 def pca_curvature(
-    points: Tensor, neighbors: int = 16, valid: Tensor | None = None, viewpoint: Tensor | None = None
+    points: Tensor, nearest: tuple[Tensor, Tensor], valid: Tensor | None = None, viewpoint: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Surface variation and normals from the covariance of each point's nearest neighbours (Pauly et al.
     2002).
 
     Args:
         points: [B, N, 3].
-        neighbors: how many nearest valid points, the point itself included, make the covariance.
+        nearest: each point's nearest valid points, itself included, which make the covariance, as :func:`knn` finds
+            them.
         valid: [B, N] bool, or None for all.
         viewpoint: [B, 3] in the points' frame; normals are turned towards it. None leaves their sign open.
 
@@ -178,7 +179,7 @@ def pca_curvature(
         normals [B, N, 3]. Both are 0 on padding.
     """
     valid = _all_valid(points, valid)
-    squared, index = knn(points, points, neighbors, valid)
+    squared, index = nearest
     weight = squared.isfinite().to(points.dtype)[..., None]
     local = gather(points, index)
     total = weight.sum(2, keepdim=True).clamp(min=1.0)

@@ -13,8 +13,8 @@ from torch import Tensor
 
 def normalize(vectors: Tensor, eps: float = 1e-12) -> Tensor:
     """Scale vectors [..., D] to unit length; vectors shorter than ``eps`` become 0."""
-    norm = vectors.norm(dim=-1, keepdim=True)
-    return torch.where(norm > eps, vectors / norm.clamp_min(eps), torch.zeros_like(vectors))
+    norm = torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+    return torch.where(norm > eps, vectors / norm.clamp_min(eps), 0.0)
 
 
 def skew(vectors: Tensor) -> Tensor:
@@ -60,11 +60,13 @@ def matrix_to_quaternion(rotation: Tensor) -> Tensor:
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices [..., 3, 3] of quaternions wxyz [..., 4] (normalised first)."""
-    w, x, y, z = normalize(quaternion).unbind(-1)
+    unit = normalize(quaternion)
+    products = 2 * unit[..., :, None] * unit[..., None, :]
+    _, wx, wy, wz, _, xx, xy, xz, _, _, yy, yz, _, _, _, zz = products.flatten(-2).unbind(-1)
     rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+        1 - (yy + zz), xy - wz, xz + wy,
+        xy + wz, 1 - (xx + zz), yz - wx,
+        xz - wy, yz + wx, 1 - (xx + yy),
     )  # fmt: skip
     return torch.stack(rows, dim=-1).reshape(*quaternion.shape[:-1], 3, 3)
 
@@ -90,31 +92,6 @@ def apply(transform: Tensor, points: Tensor) -> Tensor:
     return points @ transform[..., :3, :3].mT + transform[..., None, :3, 3]
 
 
-def alignment(source: Tensor, target: Tensor) -> Tensor:
-    """Rotation vectors [..., 3] (rad) of the shortest rotation that takes ``source`` to ``target`` [..., 3].
-
-    Supplement I.F with its two slips mended: the angle is ``phi_12`` about the *unit* axis ``v1 x v2 / |v1 x v2|``
-    (the text halves ``omega`` in place of ``phi_12`` and leaves the axis unnormalised), and opposite vectors turn by
-    pi about an axis perpendicular to both, where the cross product vanishes. ``phi_12`` is taken by atan2, which
-    unlike arccos keeps its digits near 0 and pi. A zero vector aligns with anything: rotation 0.
-    """
-    a, b = normalize(source), normalize(target)
-    cross = torch.linalg.cross(a, b)
-    sine, cosine = cross.norm(dim=-1, keepdim=True), (a * b).sum(-1, keepdim=True)
-    angle = torch.atan2(sine, cosine)
-    # Perpendicular to a: cross with the coordinate axis along which a is shortest.
-    shortest = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
-    fallback = normalize(torch.linalg.cross(a, shortest))
-    axis = torch.where(sine > 1e-7, cross / sine.clamp_min(1e-7), fallback)
-    defined = (a.norm(dim=-1, keepdim=True) > 0) & (b.norm(dim=-1, keepdim=True) > 0)
-    return torch.where(defined & (angle > 1e-7), axis * angle, torch.zeros_like(a))
-
-
-def rotation_vector_to_matrix(vector: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of rotation vectors [..., 3] (rad)."""
-    return axis_angle_to_matrix(normalize(vector), vector.norm(dim=-1))
-
-
 def euler_xyz_to_matrix(angles: Tensor) -> Tensor:
     """``Rx(roll) @ Ry(pitch) @ Rz(yaw)`` [..., 3, 3] of angles [..., 3] rad: a chain of x, y and z hinges."""
     eye = torch.eye(3, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], 3, 3)
@@ -127,7 +104,12 @@ def euler_xyz_jacobian(angles: Tensor) -> Tensor:
 
     Its columns are the world directions of the three hinges: x, ``Rx`` y and ``Rx Ry`` z.
     """
-    eye = torch.eye(3, dtype=angles.dtype, device=angles.device).expand(*angles.shape[:-1], 3, 3)
-    rx = axis_angle_to_matrix(eye[..., 0, :], angles[..., 0])
-    ry = axis_angle_to_matrix(eye[..., 1, :], angles[..., 1])
-    return torch.stack([eye[..., :, 0], rx[..., :, 1], (rx @ ry)[..., :, 2]], dim=-1)
+    roll_pitch = angles[..., :2]
+    (sin_r, sin_p), (cos_r, cos_p) = roll_pitch.sin().unbind(-1), roll_pitch.cos().unbind(-1)
+    zero, one = torch.zeros_like(sin_r), torch.ones_like(sin_r)
+    rows = (
+        one, zero, sin_p,
+        zero, cos_r, -sin_r * cos_p,
+        zero, sin_r, cos_r * cos_p,
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))

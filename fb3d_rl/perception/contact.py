@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from fb3d_rl.flow.rigid_motion import rigid_motion, screw
-from fb3d_rl.geometry.points import gather, knn, pca_curvature, squared_distances
+from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
 
 
@@ -88,33 +88,40 @@ def choose_contact(
     weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
     movable = weak & (norm >= options.min_flow * largest)
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
-    curvature, normals = pca_curvature(points, options.neighbors, on_part, camera)
+    squared = squared_distances(points, cloud)
+    among = squared[:, :, moving].masked_fill_(~on_part[:, None], torch.inf)
+    nearest = among.topk(min(options.neighbors, len(moving)), largest=False)  # as knn finds them
+    curvature, normals = pca_curvature(points, nearest, on_part, camera)
     direction = normalize(flow)
     along = (direction * normals).sum(-1, keepdim=True)
     sight = normalize(camera[:, None] - points)
     usual = torch.where(along >= options.facing, direction, normals)
     usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
 
-    squared = squared_distances(points, cloud)
-    ways = torch.stack([usual, normals, sight], dim=2)
-    free = torch.stack([~_blocked(points, cloud, squared, seen, way, options) for way in ways.unbind(2)], dim=-1)
-    first = free.int().argmax(-1)  # the first free way; the usual one where none is
-    standoff = ways.gather(2, first[..., None, None].expand(-1, -1, 1, 3)).squeeze(2)
+    # The first free way; the usual one where none is.
+    as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
+    free, standoff = as_usual, usual
+    for way in (normals, sight):
+        todo = (weak & ~free).any(0).nonzero().flatten()
+        opened = torch.zeros_like(free)
+        opened[:, todo] = ~_blocked(points[:, todo], cloud, squared[:, todo], seen, way[:, todo], options)
+        opened &= ~free
+        free, standoff = free | opened, torch.where(opened[..., None], way, standoff)
 
-    smooth = (curvature <= options.curvature) & ~_rim(points, on_part, options)
+    smooth = (curvature <= options.curvature) & ~_rim(points, nearest, options)
     fresh = ~avoid
     peak = torch.where(movable & fresh, norm, torch.full_like(norm, -1.0)).argmax(-1)
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
-    reachable = weak & smooth & fresh & free.any(-1)
+    reachable = weak & smooth & fresh & free
     clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
 
     tiers = [
-        movable & smooth & free[..., 0] & fresh & clear,
-        movable & smooth & free.any(-1) & fresh & clear,
+        movable & smooth & as_usual & fresh & clear,
+        movable & smooth & free & fresh & clear,
         reachable & clear,
-        movable & smooth & free.any(-1) & fresh,
-        movable & free.any(-1) & fresh,
+        movable & smooth & free & fresh,
+        movable & free & fresh,
         movable & smooth & fresh,
         movable & fresh,
         movable,
@@ -130,9 +137,9 @@ def choose_contact(
                  for x in (points, direction, standoff))  # type: ignore[return-value]  # fmt: skip
 
 
-def _rim(points: Tensor, on_part: Tensor, options: ContactOptions) -> Tensor:
-    """Whether the part's points around each point lie to one side of it, [B, N] bool."""
-    squared, index = knn(points, points, options.neighbors, on_part)
+def _rim(points: Tensor, nearest: tuple[Tensor, Tensor], options: ContactOptions) -> Tensor:
+    """Whether the part's points ``nearest`` to each point (:func:`knn`) lie to one side of it, [B, N] bool."""
+    squared, index = nearest
     weight = squared.isfinite().to(points.dtype)[..., None]
     total = weight.sum(2).clamp_min(1.0)
     mean = (gather(points, index) * weight).sum(2) / total
@@ -148,9 +155,9 @@ def _blocked(
     ``squared`` [B, M, N] are the squared distances from the M points to the N of the cloud.
     """
     ahead = standoff @ cloud.mT - (standoff * points).sum(-1, keepdim=True)  # [B, M, N]
-    aside = squared - ahead.square()
+    aside = torch.addcmul(squared, ahead, ahead, value=-1)
     inside = (ahead > options.clearance) & (ahead < options.reach) & (aside < options.hand_radius**2) & valid[:, None]
-    return (inside.sum(-1) > 1) | _underground(points, standoff, options)
+    return (inside.sum(-1, dtype=torch.int32) > 1) | _underground(points, standoff, options)
 
 
 def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
@@ -185,13 +192,15 @@ def _clear(
     speed = (velocity[:, None] + torch.linalg.cross(omega[:, None], contact - centre[:, None])).norm(dim=-1)
     time = options.sweep / speed.clamp_min(1e-6)
     time = torch.minimum(time, options.sweep_angle / omega.norm(dim=-1, keepdim=True).clamp_min(1e-6))
+    share = torch.linspace(0, 1, options.sweep_steps + 1, device=points.device)[1:]
+    turn, shift = screw(velocity[:, None, None], omega[:, None, None], time[..., None] * share)  # [B, K, steps, 3, 3]
+    arm, away = (contact - centre[:, None])[:, :, None, :, None], away[:, :, None, :, None]
+    at = (turn @ arm).squeeze(-1) + shift + centre[:, None, None]
     reach = torch.linspace(options.clearance, options.hand_length, 3, device=points.device)
-    clear = torch.ones_like(index, dtype=torch.bool)
-    for step in range(1, options.sweep_steps + 1):
-        turn, shift = screw(velocity[:, None], omega[:, None], time * step / options.sweep_steps)
-        at = (turn @ (contact - centre[:, None])[..., None]).squeeze(-1) + shift + centre[:, None]
-        hand = at[:, :, None] + reach[:, None] * (turn @ away[..., None]).squeeze(-1)[:, :, None]  # [B, K, 3, 3]
-        gap = torch.cdist(hand.flatten(1, 2), cloud).masked_fill(~obstacle[:, None], torch.inf).amin(-1)
-        clear &= (gap.view_as(hand[..., 0]) > options.hand_radius).all(-1) & (hand[..., 2] > 0).all(-1)
+    hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
+    # What is no obstacle is put far off.
+    gap = torch.cdist(hand.flatten(1, 3), torch.where(obstacle[..., None], cloud, 1e3)).amin(-1)
+    gap = gap.view(hand.shape[:-1])
+    clear = ((gap > options.hand_radius) & (hand[..., 2] > 0)).flatten(2).all(-1)
     result = torch.zeros_like(wanted).scatter(1, index, clear)
     return result & wanted

@@ -1,24 +1,24 @@
 """The flow policy: approach a point against its flow, touch, hold, then pull along the current flow.
 
 It does not know where its flow comes from. Fed the ground truth it is the expert; fed ArtFlowNet's prediction it is
-FlowBot3D. It is batched over environments, and its state travels in the TensorDict under "policy".
+FlowBot3D. Its state travels in the TensorDict under "policy". Each environment is steered by itself, in numbers of its
+own; what looks at all points of a cloud is batched over the environments that need it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from fb3d_rl.flow.rigid_motion import rigid_motion
-from fb3d_rl.geometry.transforms import (
-    alignment,
-    normalize,
-    rotation_vector_to_matrix,
-)
+from fb3d_rl.geometry.points import squared_distances
+from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.perception.contact import ContactOptions, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
@@ -76,6 +76,40 @@ class FlowPolicyOptions:
     contact: ContactOptions = field(default_factory=ContactOptions)
 
 
+@dataclass
+class Memory:
+    """What the policy remembers of one environment from step to step.
+
+    Attributes:
+        phase: one of the phases.
+        contact_point: where to touch, m.
+        standoff: unit direction in which the hand stands off the contact point.
+        pull: unit flow there.
+        idle: control steps in which nothing moved on.
+        leave: unit direction in which the hand backs off, or leaves the object's bounding sphere.
+        tip: the suction tip in the last step, m.
+        came: where the tip came from, m, faded.
+        tried: the last ``TRIES`` points that were tried in vain, m.
+        tries: how many that were.
+    """
+
+    phase: int
+    contact_point: Vector
+    standoff: Vector
+    pull: Vector
+    idle: int
+    leave: Vector
+    tip: Vector
+    came: Vector
+    tried: np.ndarray
+    tries: int
+
+    def give_up(self, point: Vector) -> None:
+        """Remember a point that was tried in vain."""
+        self.tried[self.tries % TRIES] = point
+        self.tries += 1
+
+
 class FlowPolicy(TensorDictModuleBase):
     """Turns a flow into gripper velocities.
 
@@ -123,191 +157,242 @@ class FlowPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and the next policy state."""
-        o, obs = self.options, tensordict["observation"]
-        state = tensordict["policy"].clone()
-        tip, hand = obs["tool_pose"][..., :3], hand_axis(obs["tool_pose"])
-        flow = torch.where((obs["part_mask"] & obs["valid"])[..., None], tensordict[self.flow_key], 0.0)
+        obs, flow = tensordict["observation"], tensordict[self.flow_key]
+        tool_pose = obs["tool_pose"]
+        axis = hand_axis(tool_pose)
+        tips, hands = _numbers(tool_pose[:, :3]), _numbers(axis)
+        attached, force = obs["attached"].flatten().tolist(), obs["contact_force"].flatten().tolist()
+        memories = _recall(tensordict["policy"])
+        pulled = [memory.phase == PULL for memory in memories]
 
-        self._advance(state, obs, flow, tip, hand)
-        phase = state["phase"]
-        velocity = self._path_velocity(state, obs, tip)
-        pulling = bool((phase == PULL).any())
-        pull = self._flow_at(obs, flow, tip, state["pull"]) if pulling else state["pull"]
-        # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
-        turned = rotation_vector_to_matrix(alignment(state["pull"], pull)) @ state["standoff"][..., None]
-        goes_on = (phase == PULL) & (tensordict["policy", "phase"] == PULL)
-        state["standoff"] = torch.where(goes_on, turned.squeeze(-1), state["standoff"])
-        state["pull"] = torch.where(phase == PULL, pull, state["pull"])
-        velocity = torch.where(phase == PULL, o.pull_speed * pull, velocity)
-        wanted = self._above_ground(state["standoff"], tip)
-        angular = o.angular_gain * alignment(hand, wanted)
-        tensordict["action"] = joint_velocities(obs, hand, velocity, angular, self.limits)
-        tensordict["next", "policy"] = state
+        for i, memory in enumerate(memories):
+            self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force)
+        self._choose(memories, obs, flow)
+        pulls = self._flow_at(memories, obs, flow)
+        spheres = self._bounding_spheres(memories, obs)
+
+        twists = np.empty((len(memories), 6))
+        for i, (memory, tip, hand) in enumerate(zip(memories, tips, hands, strict=True)):
+            if memory.phase == PULL:
+                if pulled[i]:
+                    # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
+                    memory.standoff = rotate(memory.standoff, alignment(memory.pull, pulls[i]))
+                memory.pull = pulls[i]
+                velocity = self.options.pull_speed * memory.pull
+            elif memory.phase == TRAVEL:
+                velocity = self._travel(memory, tip, *spheres[i])
+            else:
+                velocity = self._path_velocity(memory, tip)
+            wanted = self._above_ground(memory.standoff, tip)
+            twists[i, :3], twists[i, 3:] = velocity, self.options.angular_gain * alignment(hand, wanted)
+        twist = torch.from_numpy(twists).to(axis)
+        tensordict["action"] = joint_velocities(obs, axis, twist[:, :3], twist[:, 3:], self.limits)
+        tensordict["next", "policy"] = self._state(memories, tensordict.device)
         return tensordict
 
-    def _advance(self, state: TensorDictBase, obs: TensorDictBase, flow: Tensor, tip: Tensor, hand: Tensor) -> None:
-        """Move every environment to the phase that its observation calls for."""
+    def _advance(self, memory: Memory, tip: Vector, hand: Vector, attached: bool, touches: bool) -> None:
+        """Move on to the phase that the observation calls for."""
+        o, m = self.options, memory
+        moved, came = tip - m.tip, m.came
+        m.tip, m.came = tip, np.zeros(3)
+        offset = tip - m.contact_point
+        height = float(offset @ m.standoff)
+        halted = touches and length(moved) < o.stuck_progress
+
+        if m.phase == SELECT:
+            m.idle = 0
+        elif m.phase == TRAVEL:
+            m.idle = m.idle + 1 if halted else 0
+            m.came = 0.8 * came - moved
+            if m.idle > o.stuck_steps:  # something stands in the way that the cloud does not show
+                m.give_up(m.contact_point)
+                m.leave = normalize(m.came)
+                m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
+            elif (
+                length(alignment(hand, m.standoff)) < 0.15
+                and length(offset - height * m.standoff) < 0.04
+                and height > 0
+            ):
+                m.phase = APPROACH
+        elif m.phase == APPROACH:
+            m.idle = m.idle + 1 if touches else 0
+            if not attached and (m.idle > o.patience or height < -o.overshoot):
+                m.give_up(m.contact_point)
+                m.phase, m.leave = RETREAT, m.standoff
+        elif m.phase == PULL:
+            m.idle = m.idle + 1 if attached and moved @ m.pull < o.stuck_progress else 0
+            if not attached:
+                # It backs off from where it is, not from a contact point that is far away.
+                m.phase, m.leave, m.contact_point, m.standoff = RETREAT, m.standoff, tip, hand
+            elif m.idle > o.stuck_steps:
+                m.give_up(tip)
+                m.phase, m.leave, m.idle = RELEASE, _across(hand, m.pull), 0
+        elif m.phase == RETREAT:
+            m.idle = m.idle + 1 if halted else 0
+            if offset @ m.leave > o.precontact or m.idle > o.stuck_steps:
+                m.phase = SELECT
+        elif m.phase == RELEASE:
+            m.idle += 1
+            if not attached:
+                m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
+            if m.idle > 3 * o.stuck_steps:  # it does not come off: pull on
+                m.phase, m.idle = PULL, 0
+
+        if attached and m.phase not in (PULL, RELEASE):
+            if m.phase != APPROACH:  # held by chance, from another side than chosen
+                m.standoff = hand
+            m.phase = PULL
+
+    def _choose(self, memories: list[Memory], obs: TensorDictBase, flow: Tensor) -> None:
+        """Choose a contact point in the environments that are about to, and send them there."""
+        rows = _in_phase(memories, SELECT)
+        if not rows:
+            return
+        points, valid, part, camera, flow = (
+            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], flow)
+        )
+        flow = torch.where((part & valid)[..., None], flow, 0.0)
+        avoid = torch.zeros_like(valid)
+        for k, i in enumerate(rows):
+            for tried in torch.from_numpy(memories[i].tried[: memories[i].tries]).to(points):
+                avoid[k] |= (points[k] - tried).norm(dim=-1) < self.options.retry_distance
+        chosen = choose_contact(points, valid, part, flow, camera, avoid, self.options.contact)
+        for i, *found in zip(rows, *map(_numbers, chosen), strict=True):
+            memory = memories[i]
+            memory.contact_point, memory.pull, memory.standoff = found
+            if memory.pull.any():
+                memory.phase = TRAVEL
+
+    def _path_velocity(self, memory: Memory, tip: Vector) -> Vector:
+        """Tip velocity (m/s) of the phases APPROACH, RETREAT and RELEASE; 0 while no contact point can be chosen."""
         o = self.options
-        phase = state["phase"].squeeze(-1)
-        attached = obs["attached"].squeeze(-1)
+        if memory.phase == APPROACH:
+            offset = tip - memory.contact_point
+            height = float(offset @ memory.standoff)
+            sideways = offset - height * memory.standoff
+            speed = min(max(10.0 * (height - o.precontact), o.touch_speed), o.approach_speed)
+            return -speed * memory.standoff - 8.0 * sideways
+        if memory.phase == RETREAT:
+            return o.approach_speed * memory.leave
+        if memory.phase == RELEASE:
+            return self.limits.linear * memory.leave
+        return np.zeros(3)
 
-        touches = obs["contact_force"].squeeze(-1) > o.force
-        pressed = (phase == APPROACH) & touches
-        moved = tip - state["tip"]
-        halted = ((phase == TRAVEL) | (phase == RETREAT)) & touches & (moved.norm(dim=-1) < o.stuck_progress)
-        state["came"] = torch.where((phase == TRAVEL)[:, None], 0.8 * state["came"] - moved, 0.0)
-        progress = (moved * state["pull"]).sum(-1)
-        state["tip"] = tip.clone()
-        idle = (phase == PULL) & attached & (progress < o.stuck_progress)
-        count = torch.where(pressed | halted | idle | (phase == RELEASE), state["idle"].squeeze(-1) + 1, 0)
-        offset = tip - state["contact_point"]
-        height = (offset * state["standoff"]).sum(-1)
-        failed = (phase == APPROACH) & ((count > o.patience) | (height < -o.overshoot)) & ~attached
-        blocked = (phase == TRAVEL) & (
-            count > o.stuck_steps
-        )  # something stands in the way that the cloud does not show
-        stuck = (phase == PULL) & (count > o.stuck_steps)
-        in_vain = failed | blocked | stuck
-        slot = (state["tries"] % TRIES)[..., None].expand(-1, 1, 3)
-        remembered = state["tried"].scatter(1, slot, torch.where(stuck[:, None], tip, state["contact_point"])[:, None])
-        state["tried"] = torch.where(in_vain[:, None, None], remembered, state["tried"])
-        state["tries"] = state["tries"] + in_vain[:, None].long()
+    def _bounding_spheres(self, memories: list[Memory], obs: TensorDictBase) -> dict[int, tuple[Vector, float]]:
+        """Centre and radius (m), with a margin, of a sphere around the cloud of each environment on its way."""
+        rows = _in_phase(memories, TRAVEL)
+        if not rows:
+            return {}
+        points, valid = _rows(obs["points"], rows), _rows(obs["valid"], rows)[..., None]
+        low = torch.where(valid, points, torch.inf).amin(1)
+        high = torch.where(valid, points, -torch.inf).amax(1)
+        centre = torch.nan_to_num(0.5 * (low + high), posinf=0.0, neginf=0.0)
+        radius = torch.where(valid, points - centre[:, None], 0.0).norm(dim=-1).amax(-1) + self.options.margin
+        return dict(zip(rows, zip(_numbers(centre), radius.tolist(), strict=True), strict=True))
 
-        lost = ((phase == PULL) | (phase == RELEASE)) & ~attached
-        given_up = failed | blocked | lost
-        state["leave"] = torch.where((failed | (lost & (phase == PULL)))[:, None], state["standoff"], state["leave"])
-        state["leave"] = torch.where(stuck[:, None], _across(hand, state["pull"]), state["leave"])
-        state["leave"] = torch.where(blocked[:, None], normalize(state["came"]), state["leave"])
-        # It backs off from where it is, not from a contact point that is far away.
-        astray = (lost | blocked)[:, None]
-        state["contact_point"] = torch.where(astray, tip, state["contact_point"])
-        state["standoff"] = torch.where(astray, hand, state["standoff"])
-        vain = (phase == RELEASE) & (count > 3 * o.stuck_steps)  # it does not come off: pull on
-
-        far_off = (offset * state["leave"]).sum(-1) > o.precontact
-        backed_off = (phase == RETREAT) & (far_off | (count > o.stuck_steps))
-        aligned = alignment(hand, state["standoff"]).norm(dim=-1) < 0.15
-        on_line = (offset - height[:, None] * state["standoff"]).norm(dim=-1) < 0.04
-        ready = (phase == TRAVEL) & aligned & on_line & (height > 0)
-        phase = torch.where(ready, APPROACH, phase)
-        phase = torch.where(given_up, RETREAT, phase)
-        phase = torch.where(backed_off, SELECT, phase)
-        phase = torch.where(stuck, RELEASE, phase)
-        caught = attached & (phase != PULL) & (phase != RELEASE)
-        # Held by chance, from another side than chosen.
-        state["standoff"] = torch.where((caught & (phase != APPROACH))[:, None], hand, state["standoff"])
-        phase = torch.where(caught | vain, PULL, phase)
-        state["idle"] = torch.where(stuck | vain, 0, count)[:, None]
-        choosing = phase == SELECT
-        if bool(choosing.any()):
-            chosen = choose_contact(
-                obs["points"],
-                obs["valid"],
-                obs["part_mask"],
-                flow,
-                obs["camera_position"],
-                self._avoid(state, obs),
-                o.contact,
-            )
-            for key, value in zip(("contact_point", "pull", "standoff"), chosen, strict=True):
-                state[key] = torch.where(choosing[:, None], value, state[key])
-            seen = chosen[1].norm(dim=-1) > 0
-            phase = torch.where(choosing & seen, TRAVEL, phase)
-        state["phase"] = phase[:, None]
-
-    def _avoid(self, state: TensorDictBase, obs: TensorDictBase) -> Tensor:
-        """Points [E, N] near contact points that were tried in vain."""
-        distance = (obs["points"][:, :, None] - state["tried"][:, None]).norm(dim=-1)
-        used = torch.arange(TRIES, device=distance.device) < state["tries"]
-        return ((distance < self.options.retry_distance) & used[:, None]).any(-1)
-
-    def _path_velocity(self, state: TensorDictBase, obs: TensorDictBase, tip: Tensor) -> Tensor:
-        """Tip velocity [E, 3] (m/s) of the phases TRAVEL, APPROACH and RETREAT; 0 in the others."""
-        o, phase = self.options, state["phase"]
-        contact, standoff = state["contact_point"], state["standoff"]
-        offset = tip - contact
-        height = (offset * standoff).sum(-1, keepdim=True)
-        sideways = offset - height * standoff
-
-        slowing = (10.0 * (height - o.precontact)).clamp(max=o.approach_speed).clamp_min(o.touch_speed)
-        approach_speed = torch.where(height > o.precontact, slowing, o.touch_speed)
-        approach = -approach_speed * standoff - 8.0 * sideways
-        retreat = o.approach_speed * state["leave"]
-        travel = self._travel(state, obs, tip) if bool((phase == TRAVEL).any()) else torch.zeros_like(tip)
-        velocity = torch.where(phase == TRAVEL, travel, torch.zeros_like(tip))
-        velocity = torch.where(phase == APPROACH, approach, velocity)
-        velocity = torch.where(phase == RETREAT, retreat, velocity)
-        return torch.where(phase == RELEASE, self.limits.linear * state["leave"], velocity)
-
-    def _travel(self, state: TensorDictBase, obs: TensorDictBase, tip: Tensor) -> Tensor:
-        """Velocity [E, 3] around the object's bounding sphere to where the approach line leaves it.
+    def _travel(self, memory: Memory, tip: Vector, centre: Vector, radius: float) -> Vector:
+        """Velocity around the object's bounding sphere to where the approach line leaves it.
 
         A hand that comes from another side of the object leaves the sphere first as it backed off before.
         """
-        o, contact, standoff, leave = self.options, state["contact_point"], state["standoff"], state["leave"]
-        valid = obs["valid"][..., None]
-        low = torch.where(valid, obs["points"], torch.inf).amin(1)
-        high = torch.where(valid, obs["points"], -torch.inf).amax(1)
-        centre = torch.nan_to_num(0.5 * (low + high), posinf=0.0, neginf=0.0)
-        radius = torch.where(valid, obs["points"] - centre[:, None], 0.0).norm(dim=-1).amax(-1, keepdim=True) + o.margin
-
+        o, contact, standoff = self.options, memory.contact_point, memory.standoff
         # |contact + t standoff - centre| = radius, the larger root
         from_centre = contact - centre
-        b = (from_centre * standoff).sum(-1, keepdim=True)
-        c = from_centre.square().sum(-1, keepdim=True) - radius.square()
-        t = -b + (b * b - c).clamp_min(0).sqrt()
-        descent = -standoff[..., 2:]
-        above_ground = (contact[..., 2:] - o.clearance) / descent.clamp_min(1e-6)
-        t = torch.where(descent > 0, torch.minimum(t, above_ground), t).clamp_min(2 * o.precontact)
-        goal = contact + t * standoff
+        b = float(from_centre @ standoff)
+        c = float(from_centre @ from_centre) - radius**2
+        t = -b + math.sqrt(max(b * b - c, 0.0))
+        descent = -standoff[2]
+        if descent > 0:
+            t = min(t, (contact[2] - o.clearance) / max(descent, 1e-6))
+        goal = contact + max(t, 2 * o.precontact) * standoff
 
-        outward, distance = normalize(tip - centre), (tip - centre).norm(dim=-1, keepdim=True)
-        turn = alignment(outward, normalize(goal - centre))
-        tangent = torch.linalg.cross(normalize(turn), outward)
-        around = tangent + (radius - distance).clamp(-1, 1) * 4.0 * outward
+        distance = length(tip - centre)
+        if distance > radius or memory.leave @ standoff >= 0.5:
+            memory.leave = np.zeros(3)
+        if memory.leave.any():
+            return o.travel_speed * memory.leave
+        outward = normalize(tip - centre)
+        turn = alignment(outward, goal - centre)
+        if length(turn) > 0.35 and distance > 0.5 * radius:
+            tangent = cross(normalize(turn), outward)
+            around = tangent + min(max(radius - distance, -1.0), 1.0) * 4.0 * outward
+            return o.travel_speed * normalize(around)
         straight = goal - tip
-        gap = straight.norm(dim=-1, keepdim=True)
-        far = (turn.norm(dim=-1, keepdim=True) > 0.35) & (distance > 0.5 * radius)
-        step = torch.where(far, normalize(around), normalize(straight))
-        speed = torch.where(far, torch.full_like(gap, o.travel_speed), (6.0 * gap).clamp(max=o.travel_speed))
-        other_side = (leave * standoff).sum(-1, keepdim=True) < 0.5
-        state["leave"] = torch.where((state["phase"] == TRAVEL) & ((distance > radius) | ~other_side), 0.0, leave)
-        return torch.where(state["leave"].any(-1, keepdim=True), o.travel_speed * leave, speed * step)
+        return min(6.0 * length(straight), o.travel_speed) * normalize(straight)
 
-    def _flow_at(self, obs: TensorDictBase, flow: Tensor, tip: Tensor, last: Tensor) -> Tensor:
-        """Unit flow [E, 3] at the held point, ``lead`` ahead; the last one where none is seen.
+    def _flow_at(self, memories: list[Memory], obs: TensorDictBase, flow: Tensor) -> dict[int, Vector]:
+        """Unit flow at the held point of each environment that pulls, ``lead`` ahead; the last one where none is seen.
 
         The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the
         near ones foremost: the hand often hides those around the held point.
         """
+        rows = _in_phase(memories, PULL)
+        if not rows:
+            return {}
         o = self.options
-        squared = (obs["points"] - tip[:, None]).square().sum(-1)
-        weight = (obs["part_mask"] & obs["valid"]) / (1.0 + squared / o.nearby**2)
-        at_tip, omega = rigid_motion(obs["points"], flow, weight, tip, 1e-2 * o.nearby**2)
-        speed = at_tip.norm(dim=-1, keepdim=True)
-        rate = o.lead * o.pull_speed * omega / speed.clamp_min(1e-6)
-        ahead = normalize(at_tip) + torch.linalg.cross(rate, normalize(at_tip))
-        return torch.where(speed > 1e-6, normalize(ahead), last)
+        points, valid, part, tool_pose, flow = (
+            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["tool_pose"], flow)
+        )
+        tip = tool_pose[:, :3]
+        squared = squared_distances(points, tip[:, None]).squeeze(-1)
+        weight = (part & valid) / (1.0 + squared / o.nearby**2)
+        motion = rigid_motion(points, flow, weight, tip, 1e-2 * o.nearby**2)
+        found = {}
+        for i, at_tip, omega in zip(rows, *map(_numbers, motion), strict=True):
+            speed = length(at_tip)
+            unit = normalize(at_tip)
+            rate = o.lead * o.pull_speed / max(speed, 1e-6) * omega
+            found[i] = normalize(unit + cross(rate, unit)) if speed > 1e-6 else memories[i].pull
+        return found
 
-    def _above_ground(self, axis: Tensor, tip: Tensor) -> Tensor:
-        """Lift unit hand axes [E, 3] that would take the hand's far end below ``clearance``."""
-        lowest = ((self.options.clearance - tip[..., 2:]) / self.options.hand_length).clamp(-1.0, 0.9)
-        height = torch.maximum(axis[..., 2:], lowest)
-        flat = normalize(axis[..., :2])
-        lifted = torch.cat([flat * (1 - height.square()).sqrt(), height], dim=-1)
-        return torch.where(height > axis[..., 2:], lifted, axis)
+    def _above_ground(self, axis: Vector, tip: Vector) -> Vector:
+        """Lift a unit hand axis that would take the hand's far end below ``clearance``."""
+        lowest = min(max((self.options.clearance - tip[2]) / self.options.hand_length, -1.0), 0.9)
+        if axis[2] >= lowest:
+            return axis
+        return np.append(normalize(axis[:2]) * math.sqrt(1.0 - lowest**2), lowest)
+
+    def _state(self, memories: list[Memory], device: torch.device | None) -> TensorDict:
+        """The TensorDict of :meth:`initial_state` that holds the memories."""
+        batch = (len(memories),)
+        state = {}
+        for key, (shape, dtype) in self.STATE.items():
+            values = np.array([getattr(memory, key) for memory in memories])
+            state[key] = torch.from_numpy(values).reshape(*batch, *shape).to(device, dtype)
+        return TensorDict(state, batch_size=batch, device=device)
 
 
-def _across(hand: Tensor, pull: Tensor) -> Tensor:
-    """Unit directions [E, 3] across ``pull`` in which the hand backs off; level ones where it comes along ``pull``.
+def _numbers(values: Tensor) -> np.ndarray:
+    """A tensor as a float64 array of its own."""
+    return values.cpu().numpy().astype(np.float64)
+
+
+def _rows(values: Tensor, rows: list[int]) -> Tensor:
+    """Those rows [K, ...] of [E, ...]."""
+    return values if len(rows) == len(values) else values[rows]
+
+
+def _recall(state: TensorDictBase) -> list[Memory]:
+    """The memories [E] that a state holds."""
+    columns = {
+        key: state[key].flatten().tolist() if shape == (1,) else _numbers(state[key])
+        for key, (shape, _) in FlowPolicy.STATE.items()
+    }
+    return [Memory(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+
+
+def _in_phase(memories: list[Memory], phase: int) -> list[int]:
+    """Which environments are in ``phase``."""
+    return [i for i, memory in enumerate(memories) if memory.phase == phase]
+
+
+def _across(hand: Vector, pull: Vector) -> Vector:
+    """Unit direction across ``pull`` in which the hand backs off; a level one where it comes along ``pull``.
 
     Across the flow the part cannot follow, so that the suction breaks; along it the part would only be moved on.
     """
-    up = torch.zeros_like(pull)
-    up[..., 2] = 1.0
-    level = torch.linalg.cross(pull, up)
-    away = hand - (hand * pull).sum(-1, keepdim=True) * pull
-    return normalize(torch.where(away.norm(dim=-1, keepdim=True) > 0.3, away, level))
+    away = hand - (hand @ pull) * pull
+    return normalize(away if length(away) > 0.3 else cross(pull, np.array([0.0, 0.0, 1.0])))
 
 
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:

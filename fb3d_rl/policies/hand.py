@@ -25,9 +25,9 @@ def hand_axis(tool_pose: Tensor) -> Tensor:
     return -quaternion_to_matrix(tool_pose[..., 3:])[..., 0]
 
 
-def across(hand: Tensor) -> Tensor:
-    """Projection [..., 3, 3] on the plane across unit hand axes [..., 3]; the spin about the axis is free."""
-    return torch.eye(3, dtype=hand.dtype, device=hand.device) - hand[..., :, None] * hand[..., None, :]
+def across(hand: Tensor, vectors: Tensor) -> Tensor:
+    """The part of vectors [..., 3] across unit hand axes [..., 3]; the spin about the axis is free."""
+    return vectors - (hand * vectors).sum(-1, keepdim=True) * hand
 
 
 def joint_velocities(
@@ -46,12 +46,12 @@ def joint_velocities(
         limits: what action 1 means.
     """
     jacobian = euler_xyz_jacobian(obs["qpos"][..., 3:6])
-    side = across(hand)
-    wanted = (side @ angular[..., None]).squeeze(-1)
-    wanted = wanted * (limits.angular / wanted.norm(dim=-1, keepdim=True).clamp_min(1e-9)).clamp(max=1.0)
-    turning = side @ jacobian
-    gram = turning.mT @ turning + 1e-2 * torch.eye(3, dtype=hand.dtype, device=hand.device)
-    rates = torch.linalg.solve(gram, (turning.mT @ wanted[..., None])).squeeze(-1)
+    wanted = across(hand, angular)
+    speed = torch.linalg.vector_norm(wanted, dim=-1, keepdim=True)
+    wanted = wanted * (limits.angular / speed.clamp_min(1e-9)).clamp_max(1.0)
+    turning = across(hand[..., None, :], jacobian.mT)  # one row for each of the three angles
+    gram = turning @ turning.mT + 1e-2 * torch.eye(3, dtype=hand.dtype, device=hand.device)
+    rates = torch.cholesky_solve(turning @ wanted[..., None], torch.linalg.cholesky(gram)).squeeze(-1)
     rates = rates.clamp(-limits.angular, limits.angular)
     omega = (jacobian @ rates[..., None]).squeeze(-1)
     lever = obs["tool_pose"][..., :3] - obs["qpos"][..., :3]
@@ -74,4 +74,4 @@ def hand_velocities(obs: TensorDictBase, hand: Tensor, joints: Tensor) -> tuple[
     omega = (euler_xyz_jacobian(obs["qpos"][..., 3:6]) @ joints[..., 3:6, None]).squeeze(-1)
     lever = obs["tool_pose"][..., :3] - obs["qpos"][..., :3]
     velocity = joints[..., :3] + torch.linalg.cross(omega, lever)
-    return velocity, (across(hand) @ omega[..., None]).squeeze(-1)
+    return velocity, across(hand, omega)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -11,8 +12,9 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
 from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.contract import Key
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.evaluation import benchmark
 from fb3d_rl.evaluation.trials import schedule
 
@@ -40,6 +42,30 @@ def test_rates_are_of_the_same_steps(objects: list[ArticulatedObject], monkeypat
     assert 0.1 < found["point cloud / no observation"] < 1
     assert len(made) == len(objects) + 2 and not any(env.idle for env in made), "every step was of a trial"
     assert found["ManiSkill's point cloud"] == "not measured: not asked for"
+
+
+def test_labelled_rows_are_those_that_the_learner_collects_alone(
+    objects: list[ArticulatedObject], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    labels, run = {}, benchmark.Workers.run
+
+    def recorded(self: benchmark.Workers, trials: list[Trial], keys: list[Key]) -> Iterator[object]:
+        for episode in run(self, trials, keys):
+            assert episode.frames is not None
+            labels.setdefault(episode.index, {})[len(keys)] = episode.frames
+            yield episode
+
+    monkeypatch.setattr(benchmark.Workers, "run", recorded)
+    found = benchmark.labelling(objects, OPTIONS, rounds=1, progress=silent)
+    episodes = benchmark.expert_episodes(objects, OPTIONS)
+    assert found["rows"] == sum(len(episode.actions) for episode in episodes) > 20
+    for i, episode in enumerate(episodes):
+        alone, labelled = labels[i][1], labels[i][2]
+        assert torch.equal(alone["observation", "points"], labelled["observation", "points"])
+        # On its own way the expert would do the same again.
+        torch.testing.assert_close(labelled["expert", "action"], episode.actions, atol=1e-5, rtol=0)
+    assert 0.2 < found["labelled / alone"] < 1.1
+    assert found["labelled by the expert, rows/s"] > 0
 
 
 def test_one_core_is_given_back() -> None:

@@ -92,17 +92,18 @@ def test_curvature_and_normals_of_plane_sphere_and_corner() -> None:
     plane = torch.rand(1, 300, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.0])
     sphere = torch.nn.functional.normalize(torch.randn(1, 300, 3, generator=generator), dim=2)
     above = torch.tensor([[0.5, 0.5, 9.0]])
-    curvature, normals = ops.pca_curvature(plane, 12, viewpoint=above)
+    curvature, normals = ops.pca_curvature(plane, ops.knn(plane, plane, 12), viewpoint=above)
     assert curvature.abs().max() < 1e-6
     torch.testing.assert_close(normals, torch.tensor([0.0, 0, 1]).expand_as(normals), atol=1e-3, rtol=0)
-    curvature, normals = ops.pca_curvature(sphere, 12, viewpoint=torch.zeros(1, 3))
+    curvature, normals = ops.pca_curvature(sphere, ops.knn(sphere, sphere, 12), viewpoint=torch.zeros(1, 3))
     assert curvature.min() > 1e-4 and curvature.max() < 1 / 3
     assert (normals * -sphere).sum(2).mean() > 0.97
     # Padding neither counts as a neighbour nor gets a value.
     noisy = torch.cat([plane, torch.rand(1, 300, 3, generator=generator)], 1)
     valid = torch.arange(600)[None] < 300
-    curvature, normals = ops.pca_curvature(noisy, 12, valid)
+    curvature, normals = ops.pca_curvature(noisy, ops.knn(noisy, noisy, 12, valid), valid)
     assert curvature.abs().max() < 1e-6
     assert normals[:, 300:].abs().max() == 0
     # Too few points for a plane still give numbers.
-    assert torch.cat([x.flatten() for x in ops.pca_curvature(plane[:, :2], 12)]).isfinite().all()
+    two = plane[:, :2]
+    assert torch.cat([x.flatten() for x in ops.pca_curvature(two, ops.knn(two, two, 12))]).isfinite().all()

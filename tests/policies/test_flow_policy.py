@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -189,11 +190,11 @@ def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, floa
 
 def test_the_hand_is_kept_above_the_ground() -> None:
     policy = expert_policy(LIMITS, replace(FlowPolicyOptions(), clearance=0.08, hand_length=0.2))
-    down, tip = torch.tensor([[-0.1, 0.0, -0.995]]), torch.tensor([[0.0, 0.0, 0.1]])
+    down, tip = np.array([-0.1, 0.0, -0.995]), np.array([0.0, 0.0, 0.1])
     lifted = policy._above_ground(down, tip)
-    assert lifted.norm().isclose(torch.tensor(1.0), atol=1e-3)
-    assert tip[0, 2] + 0.2 * lifted[0, 2] >= 0.08 - 1e-6
-    assert torch.equal(policy._above_ground(-down, tip), -down)
+    assert np.linalg.norm(lifted) == pytest.approx(1.0, abs=1e-3)
+    assert tip[2] + 0.2 * lifted[2] >= 0.08 - 1e-6
+    assert np.array_equal(policy._above_ground(-down, tip), -down)
 
 
 def test_flowbot3d_sees_nothing_privileged_and_the_expert_differs_by_its_flow_alone() -> None:
@@ -213,12 +214,14 @@ def test_the_flow_at_the_held_point_is_read_from_the_part_s_motion_where_the_han
     points, flow = td["observation", "points"], td["privileged", "flow"]
     index = int(points[0, :, 1].argmin())
     seen = ((points - points[:, index : index + 1]).norm(dim=-1) > 0.25)[0]
-    observed = {"points": points[:, seen], "part_mask": torch.ones(1, int(seen.sum()), dtype=torch.bool)}
-    observed["valid"] = observed["part_mask"]
-    found = policy._flow_at(TensorDict(observed, [1]), flow[:, seen], points[:, index], torch.zeros(1, 3))
+    state = policy.initial_state((1,))
+    state["phase"], state["pull"] = torch.full((1, 1), PULL), torch.tensor([[0.0, 0.0, 1.0]])
+    td["observation", "tool_pose"][:, :3], td["observation", "attached"] = points[:, index], torch.ones(1, 1).bool()
+    td["observation", "valid"], td["policy"] = seen[None], state
+    found = policy(td)["next", "policy", "pull"]
     assert torch.allclose(found, flow[:, index] / flow[:, index].norm(), atol=0.02)
-    nothing = policy._flow_at(TensorDict(observed, [1]), torch.zeros_like(flow[:, seen]), points[:, index], found)
-    assert torch.equal(nothing, found), "where no flow is seen the last one counts"
+    td["privileged", "flow"] = torch.zeros_like(flow)
+    assert torch.equal(policy(td)["next", "policy", "pull"], state["pull"]), "where none is seen the last one counts"
 
 
 def test_a_door_is_opened_by_half_a_turn_without_drifting_off_the_held_point() -> None:
