@@ -22,6 +22,9 @@ LEARNING = {
 }
 """Panels of a run's learning curve: title -> key in the log -> what it is."""
 
+SHOWN = tuple(key for title, keys in LEARNING.items() if title != "loss" for key in keys)
+"""What is shown over labels need not be shown over steps again; the loss moves within a round."""
+
 
 @dataclass(frozen=True)
 class Line:

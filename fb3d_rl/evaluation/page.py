@@ -79,14 +79,14 @@ select, button { font: inherit; color: inherit; background: var(--ground); borde
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 430px), 1fr)); gap: 12px;
   margin-top: 10px; }
 .grid > * { min-width: 0; }
-td .dot { margin-right: 7px; }
+td.named { padding-left: 26px; } td.named .dot { float: left; margin: 5px 0 0 -17px; }
 video { width: 100%; border-radius: 6px; display: block; background: #fff; }
 @media (max-width: 600px) {
   main { padding: 20px 12px 48px; } .panel { padding: 8px; } .wide, .scroll { padding: 0; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin-bottom: 6px; }
   .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px; } .card .value { font-size: 21px; }
   th, td { padding: 5px 7px; }
-  .wide .text:first-child { white-space: normal; overflow-wrap: anywhere; min-width: 96px; max-width: 132px; }
+  .wide .text:first-child { white-space: normal; overflow-wrap: break-word; max-width: 150px; }
 }
 """
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -64,12 +65,11 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     numbers = run.summary
     name = run_dir.resolve().name
     learned = curves.learning_curve(run.log)
-    skip = [key for title, keys in curves.LEARNING.items() if title != "loss" for key in keys]
     body = (
         f"<header><h1>{text(name)}</h1>{page.facts(_facts(numbers))}</header>"
         + page.section("Results", _headline(numbers))
         + page.section("Learning curve", learned)
-        + page.section("Training", curves.training([("", "", run.log)], skip if learned else ()))
+        + page.section("Training", curves.training([("", "", run.log)], curves.SHOWN if learned else ()))
         + page.section("Success by category", _success_bars(numbers))
         + page.section("Numbers by category", _category_table(numbers), _split_table(numbers))
         + page.section("True and predicted flow", _viewer(run.clouds))
@@ -97,16 +97,17 @@ def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = 
     labels += [group.label for group in found.groups if group.label not in labels]
     colors = {label: page.color(i) for i, label in enumerate(labels)}
     logs = [(group.label, colors[group.label], [run.log for run in group.runs]) for group in found.groups]
+    learned = curves.learning_curves(logs)
     steps = [(name, color, log) for name, color, of_runs in logs for log in of_runs]
     body = (
         f"<header><h1>{_title(found)}</h1>{_left_out(unfinished)}</header>"
         + page.section("Results", _entry_table(found, colors), _split_entries(found, colors))
-        + page.section("Side by side", _entry_bars(found))
+        + page.section("Side by side", _entry_bars(found, colors))
         + page.section("Differences on the same trials", _difference_tables(found, colors))
-        + page.section("Learning curves", curves.learning_curves(logs))
+        + page.section("Learning curves", learned)
         + page.section("Success by category", _entry_categories(found, colors))
         + page.section("Flow", _flow_table(found))
-        + page.section("Training", curves.training(steps))
+        + page.section("Training", curves.training(steps, skip=curves.SHOWN if learned else ()))
         + page.section("How the numbers come about", _told(found))
         + page.section("What was run", *map(_group_facts, found.groups))
     )
@@ -178,7 +179,7 @@ def _bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: 
         orientation="h",
         name=text(name),
         marker={"color": color, "opacity": 0.5},
-        y=[text(label) for label, _, _ in known],
+        y=[text(label).replace("\n", "<br>") for label, _, _ in known],
         x=[value for _, value, _ in known],
         error_x={
             "type": "data",
@@ -412,7 +413,7 @@ def _plain_table(head: Sequence[str], body: str) -> str:
 
 
 def _named(label: str, colors: Mapping[str, str]) -> str:
-    return f'<td class="text">{page.swatch(colors[label])}{text(label)}</td>'
+    return f'<td class="text named">{page.swatch(colors[label])}{text(label)}</td>'
 
 
 def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> str:
@@ -422,22 +423,24 @@ def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") 
     if not entries:
         return ""
     several = not split and any(len(entry.seeds) > 1 for entry in entries)
-    labelled = any(entry.labels is not None for entry in entries)
-    head = ["policy", "seeds", "trials", "objects", "contact", "success", "success, class mean"]
-    head += ["success, range over seeds"] * several + ["normalized distance"] + ["labels", "expert steps"] * labelled
+    labelled = not split and any(entry.labels is not None for entry in entries)
+    head = ["policy", "success", "success, class mean"] + ["success, range over seeds"] * several
+    head += ["contact", "normalized distance"] + ["labels", "expert steps"] * labelled
     body = ""
     for entry in entries:
-        body += f'<tr class="mean">{_named(entry.label, colors)}{_cell(text(comparison.show_seeds(entry)))}'
-        body += "".join(_cell(str(numbers[f"{entry.label}/{key}"])) for key in ("n", "n_objects"))
-        for metric, suffix in ((CONTACT, ""), (SUCCESS, ""), (SUCCESS, "_class_mean")):
-            body += _cell(*comparison.cells(entry, numbers, metric, suffix))
+        body += f'<tr class="mean">{_named(entry.label, colors)}'
+        body += _cell(*comparison.cells(entry, numbers, SUCCESS))
+        body += _cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean"))
         if several:
             body += _cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–")
-        body += _cell(*comparison.cells(entry, numbers, DISTANCE))
+        body += _cell(*comparison.cells(entry, numbers, CONTACT)) + _cell(*comparison.cells(entry, numbers, DISTANCE))
         if labelled:
             body += _cell(comparison.show_labels(entry.labels)) + _cell(comparison.show_share(entry.expert_share))
+        body += "".join(f"<td>{numbers[f'{entry.label}/{key}']}</td>" for key in ("n", "n_objects"))
+        body += f"<td>{text(comparison.show_seeds(entry))}</td>"
         body += "</tr>"
-    return _plain_table(head, body)
+    note = "" if split else '<p class="soft">Small print: 95 % intervals from resampling objects, see below.</p>'
+    return note + _plain_table([*head, "trials", "objects", "seeds"], body)
 
 
 def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
@@ -445,30 +448,38 @@ def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
     return "".join(f"<h3>Split {text(name)}</h3>{_entry_table(found, colors, name)}" for name in splits)
 
 
-def _entry_bars(found: Comparison) -> str:
+def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
+    """Instance means in the policies' colours."""
     blocks = []
     for metric in (SUCCESS, DISTANCE) if found.entries else ():
         plot = go.Figure()
-        for i, (title, suffix) in enumerate((("instance mean", ""), ("class mean", "_class_mean"))):
-            keys = [f"{entry.label}/{metric.key}{suffix}" for entry in found.entries]
-            values = [(found.numbers.get(key), found.numbers.get(f"{key}_ci95")) for key in keys]
-            _bars(plot, title, page.color(i), [entry.label.replace(" · ", "\n") for entry in found.entries], values)
+        for entry in found.entries:
+            key = f"{entry.label}/{metric.key}"
+            value = (found.numbers.get(key), found.numbers.get(f"{key}_ci95"))
+            _bars(plot, entry.label, colors[entry.label], [_broken(entry.label)], [value])
         plot.update_layout(
             template="none",
-            barmode="group",
-            bargap=0.3,
-            height=110 + 42 * len(found.entries),
-            margin={"l": 8, "r": 16, "t": 34, "b": 40},
-            legend={"orientation": "h", "y": 1, "yanchor": "bottom", "traceorder": "normal"},
+            barmode="overlay",
+            bargap=0.4,
+            height=70 + 34 * len(found.entries),
+            margin={"l": 8, "r": 16, "t": 12, "b": 40},
+            showlegend=False,
             xaxis={
-                "tickformat": ".0%" if metric.percent else ".2f",
+                "tickformat": ".0%" if metric.percent else ".1f",
                 "rangemode": "tozero",
                 "title": {"text": f"{metric.label}, with 95 % interval"},
             },
             yaxis={"autorange": "reversed", "automargin": True, "ticksuffix": "  "},
         )
+        if metric.percent:
+            plot.update_xaxes(range=[0, 1.02])
         blocks.append(page.figure(metric.key, plot))
     return page.grid(blocks) if blocks else ""
+
+
+def _broken(label: str) -> str:
+    """A long label on several lines, which leaves the bars their room on a phone."""
+    return "\n".join(textwrap.wrap(label, 24))
 
 
 def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:

@@ -132,11 +132,16 @@ def _state(folder: Path) -> str:
 def _folders(path: Path) -> Iterator[Path]:
     """``path`` and the folders below it, those inside of runs left out (they hold objects and samples)."""
     for name, below, _ in os.walk(path):
-        # Numbers by their value: seed=2 comes before seed=10.
-        below.sort(key=lambda part: [int(p) if i % 2 else p for i, p in enumerate(re.split(r"(\d+)", part))])
+        below.sort(key=_natural)
         if _state(Path(name)):
             below.clear()
         yield Path(name)
+
+
+def _natural(name: str) -> tuple[list[str | float], str]:
+    """Sort key that takes numbers by their value: seed=2 comes before seed=10."""
+    parts = re.split(r"(\d+(?:\.\d+)?)", name)
+    return [float(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
 def labels(paths: Sequence[Path]) -> list[str]:

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation.comparison import compare
 from fb3d_rl.evaluation.report import write_comparison, write_report
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.runs import read_run
 from fb3d_rl.evaluation.tables import summary
 
 ROOT = Path(__file__).parents[2]
@@ -194,15 +196,17 @@ def test_writing_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
 def test_comparison_names_every_run_and_policy(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "a" / "first"
     fill(other)
-    compared = Page(write_comparison([run, other], tmp_path / "out" / "comparison.html"))
+    (other / "config.yaml").write_text("name: other\n")
+    found = compare([read_run(run), read_run(other)])
+    compared = Page(write_comparison(found, tmp_path / "out" / "comparison.html"))
     shown = " ".join(compared.text)
-    for label in (f"{run.parent.name}/first", "a/first"):
+    for label in (f"{run.parent.name}/first", "a/first", "artflownet · name=other"):
         assert label in shown
-    assert shown.count("artflownet") >= 2
+    assert "0.80" in shown, "the flow's cosine"
     figure = json.dumps(compared.json_of("data-figure", "success_rate"))
-    assert "a/first \\u00b7 artflownet" in figure
+    assert "name=&lt;scrip<br>" in figure and "<scrip" not in figure
     with pytest.raises(UserError, match="twice"):
-        write_comparison([run, run], tmp_path / "comparison.html")
+        compare([read_run(run), read_run(run)])
 
 
 def test_command_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
