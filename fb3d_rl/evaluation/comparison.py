@@ -389,8 +389,11 @@ def cells(entry: Entry, numbers: Mapping[str, Any], metric: Metric, suffix: str 
 
 
 def show_seeds(entry: Entry) -> str:
-    """Seeds for people."""
-    return ", ".join("–" if seed is None else str(seed) for seed in entry.seeds)
+    """Seeds for people: "0, 2", "0–9"."""
+    known = [seed for seed in entry.seeds if seed is not None]
+    if len(known) > 3 and known == list(range(known[0], known[-1] + 1)):
+        return f"{known[0]}–{known[-1]}"
+    return ", ".join(map(str, known)) or "–"
 
 
 def show_labels(value: float | None) -> str:

@@ -22,8 +22,8 @@ LEARNING = {
 }
 """Panels of a run's learning curve: title -> key in the log -> what it is."""
 
-SHOWN = tuple(key for title, keys in LEARNING.items() if title != "loss" for key in keys)
-"""What is shown over labels need not be shown over steps again; the loss moves within a round."""
+OVER_LABELS = tuple(key for title, keys in LEARNING.items() if title != "loss" for key in keys)
+"""What tells more over labels than over steps; the loss moves within a round."""
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,13 @@ def training(logs: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], skip:
     return head + page.grid(blocks)
 
 
+def once_a_round(log: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Keys of :func:`learning_curve` that are logged at most once a round: over steps they look the same."""
+    count = len(learning.rounds(log))
+    keys = [key for titled in LEARNING.values() for key in titled]
+    return [key for key in keys if count > 1 and sum(is_number(row.get(key)) for row in log) <= count]
+
+
 def learning_curve(log: Sequence[Mapping[str, Any]]) -> str:
     """What a run of several rounds learned from how many labels; nothing for other runs."""
     if len(learning.rounds(log)) < 2:
@@ -168,5 +175,7 @@ def learning_curves(groups: Sequence[tuple[str, str, Sequence[Sequence[Mapping[s
             blocks.append(panel(f"success-{k}-{x_title}", title, x_title, lines, legend=False, percent=True))
     if not blocks:
         return ""
-    note = "Mean over seeds; the band goes from the lowest to the highest seed. A dot: a policy of a single round."
+    note = "Mean over seeds; the band goes from the lowest to the highest seed."
+    if any(len(learning.rounds(log)) == 1 for _, _, logs in groups for log in logs):
+        note += " A dot: a single round."
     return page.legend(shown.items()) + f'<p class="soft">{note}</p>' + page.grid(blocks)

@@ -6,6 +6,7 @@ is called body or block is HTML already; :func:`text` makes strings from outside
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 from collections.abc import Iterable, Sequence
@@ -26,7 +27,7 @@ def color(index: int) -> str:
 TRUE, PREDICTED, PART, STATIC = "#2f9e77", "#e0782f", "#3b7dd8", "#98a2b3"
 """Colours of the viewer: true flow, predicted flow, points of the target part, other points."""
 
-_CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+_CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:"
 
 _CSS = """
 :root { color-scheme: light dark; --ground: #f6f7f9; --panel: #fff; --ink: #1a1f2b; --soft: #5c6575;
@@ -78,7 +79,9 @@ select, button { font: inherit; color: inherit; background: var(--ground); borde
 .legend { color: var(--soft); font-size: 13px; display: flex; flex-wrap: wrap; gap: 4px 14px; }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 430px), 1fr)); gap: 12px;
   margin-top: 10px; }
+.grid.small { grid-template-columns: repeat(auto-fill, minmax(min(100%, 260px), 1fr)); }
 .grid > * { min-width: 0; }
+figure { margin: 0; } figcaption { color: var(--soft); font-size: 13px; margin-top: 6px; overflow-wrap: anywhere; }
 td.named { padding-left: 26px; } td.named .dot { float: left; margin: 5px 0 0 -17px; }
 video { width: 100%; border-radius: 6px; display: block; background: #fff; }
 @media (max-width: 600px) {
@@ -233,9 +236,18 @@ def viewer(clouds: Sequence[dict[str, Any]]) -> str:
     )
 
 
-def grid(blocks: Iterable[str]) -> str:
-    """Blocks side by side, as many as fit."""
-    return f'<div class="grid">{"".join(blocks)}</div>'
+def grid(blocks: Iterable[str], size: str = "") -> str:
+    """Blocks side by side, as many as fit; ``size`` "small" fits more of them."""
+    return f'<div class="grid {size}">{"".join(blocks)}</div>'
+
+
+def video(title: str, content: bytes) -> str:
+    """An MP4 file inside the page."""
+    data = base64.b64encode(content).decode("ascii")
+    return (
+        f'<figure class="panel"><video controls muted loop playsinline preload="metadata" '
+        f'src="data:video/mp4;base64,{data}"></video><figcaption>{text(title)}</figcaption></figure>'
+    )
 
 
 def swatch(shade: str) -> str:

@@ -44,6 +44,9 @@ _FACTS = {
     "started": "Started",
     "finished": "Finished",
 }
+_VIDEO_BYTES = 6_000_000
+"""Videos inside the page: base64 makes a third more of it."""
+
 _ARROWS = 160
 """Arrows per cloud: more hide the shape."""
 
@@ -64,15 +67,15 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     run = read_run(run_dir)
     numbers = run.summary
     name = run_dir.resolve().name
-    learned = curves.learning_curve(run.log)
     body = (
         f"<header><h1>{text(name)}</h1>{page.facts(_facts(numbers))}</header>"
         + page.section("Results", _headline(numbers))
-        + page.section("Learning curve", learned)
-        + page.section("Training", curves.training([("", "", run.log)], curves.SHOWN if learned else ()))
+        + page.section("Learning curve", curves.learning_curve(run.log))
+        + page.section("Training", curves.training([("", "", run.log)], curves.once_a_round(run.log)))
         + page.section("Success by category", _success_bars(numbers))
         + page.section("Numbers by category", _category_table(numbers), _split_table(numbers))
         + page.section("True and predicted flow", _viewer(run.clouds))
+        + page.section("Videos", _videos(run_dir / "videos"))
         + page.section("Failed trials", _failures(run.rows))
         + page.section("Configuration", f'<pre class="panel">{text(run.config)}</pre>' if run.config else "")
     )
@@ -107,7 +110,7 @@ def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = 
         + page.section("Learning curves", learned)
         + page.section("Success by category", _entry_categories(found, colors))
         + page.section("Flow", _flow_table(found))
-        + page.section("Training", curves.training(steps, skip=curves.SHOWN if learned else ()))
+        + page.section("Training", curves.training(steps, skip=curves.OVER_LABELS if learned else ()))
         + page.section("How the numbers come about", _told(found))
         + page.section("What was run", *map(_group_facts, found.groups))
     )
@@ -132,7 +135,7 @@ def _facts(numbers: Mapping[str, Any]) -> list[tuple[str, object]]:
     return [(label, numbers[key]) for key, label in _FACTS.items() if numbers.get(key) not in (None, "")]
 
 
-def _reading(summaries: Sequence[Mapping[str, Any]]) -> str:
+def _terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
     """How to read the numbers that ``summaries`` have."""
     names = {name for numbers in summaries for name in tables.policies_of(numbers)}
     told = {
@@ -142,7 +145,7 @@ def _reading(summaries: Sequence[Mapping[str, Any]]) -> str:
         "Contact": bool(names),
         "Expert": "expert" in names,
     }
-    return page.facts((term, meaning) for term, meaning in READING if told.get(term, True))
+    return [(term, meaning) for term, meaning in READING if told.get(term, True)]
 
 
 def _card(metric: Metric, numbers: Mapping[str, Any], prefix: str = "") -> tuple[str, str, list[str]]:
@@ -168,7 +171,7 @@ def _headline(numbers: Mapping[str, Any]) -> str:
         blocks.append(page.cards(_card(m, numbers, prefix) for m in (SUCCESS, CONTACT, DISTANCE, MOTION_ONLY)))
     if not blocks:
         return ""
-    return "".join(blocks) + _reading([numbers])
+    return "".join(blocks) + page.facts(_terms([numbers]))
 
 
 def _bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: Sequence[tuple[Any, Any]]) -> None:
@@ -333,6 +336,19 @@ def _cloud(
 def _rounded(values: NDArray[np.float32]) -> list[list[float]]:
     rounded: list[list[float]] = np.round(values.astype(np.float64), 4).tolist()
     return rounded
+
+
+def _videos(folder: Path) -> str:
+    """The videos of a run inside the page, as many as :data:`_VIDEO_BYTES` hold."""
+    blocks, left = [], _VIDEO_BYTES
+    paths = sorted(folder.glob("*.mp4"))
+    for path in paths:
+        left -= path.stat().st_size
+        if left >= 0:
+            blocks.append(page.video(path.stem, path.read_bytes()))
+    more = len(paths) - len(blocks)
+    note = f'<p class="soft">{more} more in the folder videos/.</p>' if more else ""
+    return (page.grid(blocks, "small") if blocks else "") + note
 
 
 def _failures(rows: Sequence[TrialRow]) -> str:
@@ -528,14 +544,14 @@ def _flow_table(found: Comparison) -> str:
 
 def _told(found: Comparison) -> str:
     labelled = any(entry.labels is not None for entry in found.entries)
-    method = [(term, meaning) for term, meaning in comparison.METHOD if term != "Labels" or labelled]
-    return _reading([run.summary for group in found.groups for run in group.runs]) + page.facts(method)
+    terms = _terms([run.summary for group in found.groups for run in group.runs])
+    return page.facts([*terms, *(entry for entry in comparison.METHOD if entry[0] != "Labels" or labelled)])
 
 
 def _group_facts(group: Group) -> str:
     """What was run, told once where all runs of the group agree."""
     facts: list[tuple[str, object]] = [("Runs", ", ".join(group.names))]
-    for label, key in ((label, key) for key, label in _FACTS.items()):
+    for key, label in _FACTS.items():
         values = dict.fromkeys(str(run.summary[key]) for run in group.runs if run.summary.get(key) not in (None, ""))
         if values:
             facts.append((label, ", ".join(values) if key in ("seed", "git_revision") else " | ".join(values)))

@@ -490,6 +490,7 @@ def test_the_report_of_a_run_shows_its_learning_curve(sweep: Path, tmp_path: Pat
             assert trace["x"] == [1000.0, 2000.0, 3000.0, 4000.0, 5000.0]
     assert [trace["name"] for trace in figures["learning-expert"]["data"]] == ["share of steps", "beta"]
     assert figures["learning-expert"]["data"][1]["y"] == [1.0, 0.5, 0.25, 0.125, 0.0625]
+    assert not any(id_.startswith("training-") for id_ in page.figures), "logged once a round: seen over labels"
     # A single round makes no curve over labels.
     page = Page(write_report(sweep / "algo=bc,seed=0", tmp_path / "bc.html"))
     assert not any(id_.startswith("learning-") for id_ in page.figures)
