@@ -1,7 +1,8 @@
 """Write the report of a run, or compare runs, as one HTML file.
 
 python launch/report.py RUN              writes RUN/report.html
-python launch/report.py RUN RUN [...]    writes comparison.html next to the runs
+python launch/report.py RUN RUN [...]    writes comparison.html and comparison.csv next to the runs
+python launch/report.py SWEEP            compares all runs below a folder, such as a sweep's, and writes there
 """
 
 from __future__ import annotations
@@ -16,24 +17,34 @@ from pathlib import Path
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (2: an error that the user can mend)."""
     parser = argparse.ArgumentParser(description="Write the report of a run, or compare several runs.")
-    parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="a run folder")
+    parser.add_argument(
+        "runs", metavar="FOLDER", nargs="+", type=Path, help="a run folder, or a folder with runs below it (a sweep's)"
+    )
     parser.add_argument(
         "--out",
         type=Path,
-        help="HTML file to write (default: RUN/report.html, or comparison.html next to the runs)",
+        help="HTML file to write (default: RUN/report.html, or comparison.html in the folder or next to the runs); "
+        "a comparison's numbers go beside it as .csv",
     )
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
     from fb3d_rl.contract import UserError
-    from fb3d_rl.evaluation import report, tables
+    from fb3d_rl.evaluation import comparison, report, runs, tables
 
+    folders: list[Path] = options.runs
     try:
-        if len(options.runs) == 1:
-            path = report.write_report(options.runs[0], options.out)
-            tables.show(report.read_run(options.runs[0]).summary)
+        if len(folders) == 1 and runs.is_run(folders[0]):
+            path = report.write_report(folders[0], options.out)
+            tables.show(runs.read_run(folders[0]).summary)
         else:
-            beside = Path(os.path.commonpath([run.resolve().parent for run in options.runs]))
-            path = report.write_comparison(options.runs, options.out or beside / "comparison.html")
+            finished, unfinished = runs.find_runs(folders)
+            found = comparison.compare([runs.read_run(run) for run in finished])
+            resolved = [folder.resolve() for folder in folders]
+            beside = resolved[0] if len(folders) == 1 else Path(os.path.commonpath([run.parent for run in resolved]))
+            path = report.write_comparison(found, options.out or beside / "comparison.html", unfinished)
+            comparison.show(found)
+            if unfinished:
+                print(f"left out, not finished (no summary.json): {', '.join(map(str, unfinished))}")
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -6,6 +6,7 @@ is called body or block is HTML already; :func:`text` makes strings from outside
 
 from __future__ import annotations
 
+import base64
 import html
 import json
 from collections.abc import Iterable, Sequence
@@ -17,10 +18,16 @@ from plotly.offline import get_plotlyjs
 PALETTE = ("#3b7dd8", "#e0782f", "#2f9e77", "#a45bd0", "#c9a227", "#d1495b", "#4fa3b5", "#7d8597")
 """Colours of policies and runs, readable on light and dark ground."""
 
+
+def color(index: int) -> str:
+    """Colour of the policy or run with this place."""
+    return PALETTE[index % len(PALETTE)]
+
+
 TRUE, PREDICTED, PART, STATIC = "#2f9e77", "#e0782f", "#3b7dd8", "#98a2b3"
 """Colours of the viewer: true flow, predicted flow, points of the target part, other points."""
 
-_CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+_CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:"
 
 _CSS = """
 :root { color-scheme: light dark; --ground: #f6f7f9; --panel: #fff; --ink: #1a1f2b; --soft: #5c6575;
@@ -59,7 +66,7 @@ td.first, th.first { border-left: 1px solid var(--line); }
 tbody tr:last-child td { border-bottom: 0; }
 tr.mean td { font-weight: 600; } tr.mean small { font-weight: 400; color: var(--soft); display: block; }
 tbody + tbody { border-top: 2px solid var(--line); }
-.wide .text { position: sticky; left: 0; background: var(--panel); }
+.wide .text:first-child { position: sticky; left: 0; background: var(--panel); }
 .scroll thead th { position: sticky; top: 0; background: var(--panel); }
 .error { color: var(--bad); }
 details { margin-top: 12px; } summary { cursor: pointer; font-weight: 600; margin-bottom: 8px; }
@@ -70,6 +77,20 @@ select, button { font: inherit; color: inherit; background: var(--ground); borde
   margin-top: 12px; }
 .dot { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin-right: 5px; }
 .legend { color: var(--soft); font-size: 13px; display: flex; flex-wrap: wrap; gap: 4px 14px; }
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 430px), 1fr)); gap: 12px;
+  margin-top: 10px; }
+.grid.small { grid-template-columns: repeat(auto-fill, minmax(min(100%, 260px), 1fr)); }
+.grid > * { min-width: 0; }
+figure { margin: 0; } figcaption { color: var(--soft); font-size: 13px; margin-top: 6px; overflow-wrap: anywhere; }
+td.named { padding-left: 26px; } td.named .dot { float: left; margin: 5px 0 0 -17px; }
+video { width: 100%; border-radius: 6px; display: block; background: #fff; }
+@media (max-width: 600px) {
+  main { padding: 20px 12px 48px; } .panel { padding: 8px; } .wide, .scroll { padding: 0; }
+  dl { grid-template-columns: minmax(0, 1fr); } dd { margin-bottom: 6px; }
+  .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px; } .card .value { font-size: 21px; }
+  th, td { padding: 5px 7px; }
+  .wide .text:first-child { white-space: normal; overflow-wrap: break-word; max-width: 150px; }
+}
 """
 
 # Figures are drawn transparent; their ink comes from the page's CSS variables, again when the scheme changes.
@@ -203,23 +224,41 @@ def viewer(clouds: Sequence[dict[str, Any]]) -> str:
             length (m) at which a flow of norm 1 is drawn.
     """
     colors = {"rest": STATIC, "part": PART, "true": TRUE, "predicted": PREDICTED}
-    legend = "".join(
-        f'<span><span class="dot" style="background:{color}"></span>{label}</span>'
-        for label, color in (
-            ("part to open", PART),
-            ("other points", STATIC),
-            ("true flow", TRUE),
-            ("predicted flow", PREDICTED),
-        )
-    )
+    names = (("part to open", PART), ("other points", STATIC), ("true flow", TRUE), ("predicted flow", PREDICTED))
     content = _json({"clouds": list(clouds), "colors": colors})
     return (
         '<div class="panel"><div class="bar"><button id="cloud-back" aria-label="previous cloud">‹</button>'
         '<select id="cloud-choice" aria-label="cloud"></select>'
         '<button id="cloud-next" aria-label="next cloud">›</button>'
-        f'<button id="cloud-reset">reset view</button></div><div class="legend">{legend}</div>'
+        f'<button id="cloud-reset">reset view</button></div>{legend(names)}'
         '<div class="pair"><div>true flow</div><div>predicted flow</div></div><div id="viewer"></div></div>'
         f'<script type="application/json" id="clouds">{content}</script>'
+    )
+
+
+def grid(blocks: Iterable[str], size: str = "") -> str:
+    """Blocks side by side, as many as fit; ``size`` "small" fits more of them."""
+    return f'<div class="grid {size}">{"".join(blocks)}</div>'
+
+
+def video(title: str, content: bytes) -> str:
+    """An MP4 file inside the page."""
+    data = base64.b64encode(content).decode("ascii")
+    return (
+        f'<figure class="panel"><video controls muted loop playsinline preload="metadata" '
+        f'src="data:video/mp4;base64,{data}"></video><figcaption>{text(title)}</figcaption></figure>'
+    )
+
+
+def swatch(shade: str) -> str:
+    """A dot in a policy's colour."""
+    return f'<span class="dot" style="background:{shade}"></span>'
+
+
+def legend(entries: Iterable[tuple[str, str]]) -> str:
+    """Names with their colours, for several figures; plain text."""
+    return (
+        f'<div class="legend">{"".join(f"<span>{swatch(shade)}{text(name)}</span>" for name, shade in entries)}</div>'
     )
 
 

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import math
-import zipfile
+import textwrap
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from numpy.typing import NDArray
-from plotly.subplots import make_subplots
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.evaluation import page, tables
-from fb3d_rl.evaluation.page import PALETTE, text
-from fb3d_rl.evaluation.rows import TrialRow, policies, read_flow, read_trials, write_text
+from fb3d_rl.evaluation import comparison, curves, page, tables
+from fb3d_rl.evaluation.comparison import Comparison, Group
+from fb3d_rl.evaluation.page import text
+from fb3d_rl.evaluation.rows import TrialRow, policies, write_text
+from fb3d_rl.evaluation.runs import CLOUD_ARRAYS, read_run
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, MOTION_ONLY, SUCCESS, Metric
 
 READING = (
@@ -46,84 +44,11 @@ _FACTS = {
     "started": "Started",
     "finished": "Finished",
 }
+_VIDEO_BYTES = 6_000_000
+"""Videos inside the page: base64 makes a third more of it."""
+
 _ARROWS = 160
 """Arrows per cloud: more hide the shape."""
-
-_CLOUD_ARRAYS = ("points", "valid", "part_mask", "flow_true", "flow_predicted", "title")
-_FILES = ("config.yaml", "metrics.jsonl", "rows.csv", "flow_rows.csv", "summary.json", "clouds.npz")
-
-
-@dataclass(frozen=True)
-class Run:
-    """What a run folder holds; everything that is missing is empty or None."""
-
-    path: Path
-    config: str
-    log: list[dict[str, Any]]
-    rows: list[TrialRow]
-    summary: dict[str, Any]
-    clouds: dict[str, NDArray[Any]] | None
-
-
-def read_run(path: Path) -> Run:
-    """Read a run folder. Without a ``summary.json`` the summary is computed from the rows.
-
-    Raises:
-        UserError: ``path`` is not a run folder, or one of its files cannot be read.
-    """
-    if not any((path / name).is_file() for name in _FILES):
-        raise UserError(f"{path} is not a run folder: it holds none of {', '.join(_FILES)}.")
-    has = {name: (path / name).is_file() for name in _FILES}
-    rows = read_trials(path / "rows.csv") if has["rows.csv"] else []
-    flow = read_flow(path / "flow_rows.csv") if has["flow_rows.csv"] else []
-    return Run(
-        path=path,
-        config=_read_text(path / "config.yaml") if has["config.yaml"] else "",
-        log=_read_log(path / "metrics.jsonl") if has["metrics.jsonl"] else [],
-        rows=rows,
-        summary=_read_summary(path / "summary.json") if has["summary.json"] else tables.summary(rows, flow),
-        clouds=_read_clouds(path / "clouds.npz") if has["clouds.npz"] else None,
-    )
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text("utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"Cannot read {path}: {error}") from error
-
-
-def _read_summary(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(_read_text(path))
-    except json.JSONDecodeError as error:
-        raise UserError(f"Cannot read {path}: it is not valid JSON ({error}).") from error
-    if not isinstance(content, dict) or not isinstance(content.get("by_category"), dict):
-        raise UserError(f'Cannot read {path}: it is not a summary of a run (no "by_category").')
-    return content
-
-
-def _read_log(path: Path) -> list[dict[str, Any]]:
-    lines = _read_text(path).split("\n")
-    entries = []
-    # The part after the last newline is empty, or a line that a killed run did not finish.
-    for number, line in enumerate(lines[:-1], start=1):
-        try:
-            entry = json.loads(line)
-        except json.JSONDecodeError as error:
-            raise UserError(f"Cannot read {path}, line {number}: {error}") from error
-        if not isinstance(entry, dict):
-            raise UserError(f"Cannot read {path}, line {number}: it is not a JSON object.")
-        entries.append(entry)
-    return entries
-
-
-def _read_clouds(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in _CLOUD_ARRAYS}
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise UserError(f"Cannot read {path}: {error}") from error
 
 
 def write_report(run_dir: Path, out: Path | None = None) -> Path:
@@ -145,36 +70,56 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     body = (
         f"<header><h1>{text(name)}</h1>{page.facts(_facts(numbers))}</header>"
         + page.section("Results", _headline(numbers))
-        + page.section("Training", _curves("curves", {"": run.log}))
+        + page.section("Learning curve", curves.learning_curve(run.log))
+        + page.section("Training", curves.training([("", "", run.log)], curves.once_a_round(run.log)))
         + page.section("Success by category", _success_bars(numbers))
         + page.section("Numbers by category", _category_table(numbers), _split_table(numbers))
         + page.section("True and predicted flow", _viewer(run.clouds))
+        + page.section("Videos", _videos(run_dir / "videos"))
         + page.section("Failed trials", _failures(run.rows))
         + page.section("Configuration", f'<pre class="panel">{text(run.config)}</pre>' if run.config else "")
     )
     return _write(out or run_dir / "report.html", f"{name} · fb3d_rl", body)
 
 
-def write_comparison(runs: Sequence[Path], out: Path) -> Path:
-    """Write one HTML file that sets the headline numbers and curves of several runs side by side.
+def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = ()) -> Path:
+    """Write a comparison as one HTML file that needs no network, and its numbers beside it as a CSV file.
+
+    Args:
+        found: the comparison.
+        out: the HTML file; the table has the same name with .csv in the end.
+        unfinished: folders of runs that are not part of it, named on the page.
+
+    Returns:
+        ``out``.
 
     Raises:
-        UserError: one of ``runs`` is not a run folder, or one of its files cannot be read.
+        UserError: ``out`` cannot be written.
     """
-    loaded = dict(zip(_labels(runs), (read_run(path) for path in runs), strict=True))
-    summaries = [run.summary for run in loaded.values()]
+    labels = [entry.label for entry in found.entries]
+    labels += [group.label for group in found.groups if group.label not in labels]
+    colors = {label: page.color(i) for i, label in enumerate(labels)}
+    logs = [(group.label, colors[group.label], [run.log for run in group.runs]) for group in found.groups]
+    learned = curves.learning_curves(logs)
+    steps = [(name, color, log) for name, color, of_runs in logs for log in of_runs]
     body = (
-        f"<header><h1>Comparison of {len(runs)} runs</h1></header>"
-        + page.section("Results", _comparison_table(loaded), _reading(summaries))
-        + page.section("Side by side", _comparison_bars(loaded))
-        + page.section("Training", _curves("curves", {name: run.log for name, run in loaded.items()}))
-        + page.section("What was run", *(
-            f"<h3>{text(name)}</h3>{page.facts(_facts(run.summary))}"
-            for name, run in loaded.items()
-            if _facts(run.summary)
-        ))
-    )  # fmt: skip
-    return _write(out, "Comparison · fb3d_rl", body)
+        f"<header><h1>{_title(found)}</h1>{_left_out(unfinished)}</header>"
+        + page.section("Results", _entry_table(found, colors), _split_entries(found, colors))
+        + page.section("Side by side", _entry_bars(found, colors))
+        + page.section("Differences on the same trials", _difference_tables(found, colors))
+        + page.section("Learning curves", learned)
+        + page.section("Success by category", _entry_categories(found, colors))
+        + page.section("Flow", _flow_table(found))
+        + page.section("Training", curves.training(steps, skip=curves.OVER_LABELS if learned else ()))
+        + page.section("How the numbers come about", _told(found))
+        + page.section("What was run", *map(_group_facts, found.groups))
+    )
+    _write(out, "Comparison · fb3d_rl", body)
+    try:
+        comparison.write_csv(found, out.with_suffix(".csv"))
+    except OSError as error:
+        raise UserError(f"Cannot write {out.with_suffix('.csv')}: {error.strerror}.") from error
+    return out
 
 
 def _write(path: Path, title: str, body: str) -> Path:
@@ -186,21 +131,11 @@ def _write(path: Path, title: str, body: str) -> Path:
     return path
 
 
-def _labels(runs: Sequence[Path]) -> list[str]:
-    """Shortest tails of the paths that tell the runs apart."""
-    parts = [path.resolve().parts for path in runs]
-    for length in range(1, max(map(len, parts)) + 1):
-        labels = ["/".join(p[-length:]) for p in parts]
-        if len(set(labels)) == len(labels):
-            return labels
-    raise UserError("The same run is given twice.")
-
-
 def _facts(numbers: Mapping[str, Any]) -> list[tuple[str, object]]:
     return [(label, numbers[key]) for key, label in _FACTS.items() if numbers.get(key) not in (None, "")]
 
 
-def _reading(summaries: Sequence[Mapping[str, Any]]) -> str:
+def _terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
     """How to read the numbers that ``summaries`` have."""
     names = {name for numbers in summaries for name in tables.policies_of(numbers)}
     told = {
@@ -210,11 +145,7 @@ def _reading(summaries: Sequence[Mapping[str, Any]]) -> str:
         "Contact": bool(names),
         "Expert": "expert" in names,
     }
-    return page.facts((term, meaning) for term, meaning in READING if told.get(term, True))
-
-
-def _color(index: int) -> str:
-    return PALETTE[index % len(PALETTE)]
+    return [(term, meaning) for term, meaning in READING if told.get(term, True)]
 
 
 def _card(metric: Metric, numbers: Mapping[str, Any], prefix: str = "") -> tuple[str, str, list[str]]:
@@ -240,67 +171,7 @@ def _headline(numbers: Mapping[str, Any]) -> str:
         blocks.append(page.cards(_card(m, numbers, prefix) for m in (SUCCESS, CONTACT, DISTANCE, MOTION_ONLY)))
     if not blocks:
         return ""
-    return "".join(blocks) + _reading([numbers])
-
-
-def _curves(id_: str, logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
-    """A panel per quantity ("train/loss" and "val/loss" share the panel "loss"), timings left out."""
-    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for i, (run, log) in enumerate(logs.items()):
-        for entry in log:
-            for key, value in entry.items():
-                group, _, name = key.rpartition("/")
-                if not group or group == "time" or not _finite(value) or not _finite(entry.get("step")):
-                    continue
-                line = f"{i}\0{run}\0{group}"
-                panels.setdefault(name, {}).setdefault(line, []).append((entry["step"], value))
-    panels = {name: lines for name, lines in panels.items() if any(len(line) > 1 for line in lines.values())}
-    if not panels:
-        return ""
-    columns = min(2, len(panels))
-    count = math.ceil(len(panels) / columns)
-    titles = [text(name.replace("_", " ")) for name in panels]
-    plot = make_subplots(count, columns, subplot_titles=titles, vertical_spacing=0.3 / count)
-    several = len(logs) > 1
-    groups: list[str] = []
-    shown: set[str] = set()
-    for k, (name, lines) in enumerate(panels.items()):
-        row, column = k // columns + 1, k % columns + 1
-        for line, pairs in lines.items():
-            index, run, group = line.split("\0")
-            if group not in groups:
-                groups.append(group)
-            label = f"{run} {group}" if several else group
-            plot.add_scatter(
-                x=[step for step, _ in pairs],
-                y=[value for _, value in pairs],
-                name=text(label),
-                legendgroup=text(label),
-                showlegend=label not in shown,
-                mode="lines",
-                line={
-                    "color": _color(int(index) if several else groups.index(group)),
-                    "dash": ("solid", "dot", "dash")[groups.index(group) % 3] if several else "solid",
-                    "width": 1.8,
-                },
-                row=row,
-                col=column,
-            )
-            shown.add(label)
-        plot.update_xaxes(title_text="step" if k >= len(panels) - columns else None, row=row, col=column)
-        if "loss" in name and all(value > 0 for pairs in lines.values() for _, value in pairs):
-            plot.update_yaxes(type="log", dtick="D2", tickformat="~g", row=row, col=column)
-    plot.update_layout(
-        template="none",
-        height=90 + 240 * count,
-        margin={"l": 50, "r": 16, "t": 64, "b": 44},
-        legend={"orientation": "h", "yref": "container", "y": 1, "yanchor": "top"},
-    )
-    return page.figure(id_, plot)
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return "".join(blocks) + page.facts(_terms([numbers]))
 
 
 def _bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: Sequence[tuple[Any, Any]]) -> None:
@@ -311,7 +182,7 @@ def _bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: 
         orientation="h",
         name=text(name),
         marker={"color": color, "opacity": 0.5},
-        y=[text(label) for label, _, _ in known],
+        y=[text(label).replace("\n", "<br>") for label, _, _ in known],
         x=[value for _, value, _ in known],
         error_x={
             "type": "data",
@@ -335,7 +206,7 @@ def _success_bars(numbers: Mapping[str, Any]) -> str:
     for i, policy in enumerate(names):
         key = f"{policy}/{SUCCESS.key}"
         cells = [(v.get(key), v.get(f"{key}_ci95")) for v in (numbers["by_category"][c] for c in categories)]
-        _bars(plot, policy, _color(i), categories, cells)
+        _bars(plot, policy, page.color(i), categories, cells)
     plot.update_layout(
         template="none",
         barmode="group",
@@ -382,7 +253,7 @@ def _grouped_table(first: str, groups: Sequence[tuple[str, str, tuple[Metric, ..
     top, below = "", ""
     policy = 0
     for title, prefix, metrics in groups:
-        color = _color(policy) if prefix else "var(--line)"
+        color = page.color(policy) if prefix else "var(--line)"
         policy += bool(prefix)
         span = len(metrics) + bool(prefix)
         top += f'<th class="group first" style="--swatch:{color}" colspan="{span}">{text(title)}</th>'
@@ -418,7 +289,7 @@ def _table_row(
 def _viewer(clouds: Mapping[str, NDArray[Any]] | None) -> str:
     if clouds is None:
         return ""
-    samples = zip(*(clouds[name] for name in _CLOUD_ARRAYS), strict=True)
+    samples = zip(*(clouds[name] for name in CLOUD_ARRAYS), strict=True)
     prepared = [_cloud(*sample) for sample in samples if sample[1].any()]
     if not prepared:
         return ""
@@ -465,6 +336,19 @@ def _cloud(
 def _rounded(values: NDArray[np.float32]) -> list[list[float]]:
     rounded: list[list[float]] = np.round(values.astype(np.float64), 4).tolist()
     return rounded
+
+
+def _videos(folder: Path) -> str:
+    """The videos of a run inside the page, as many as :data:`_VIDEO_BYTES` hold."""
+    blocks, left = [], _VIDEO_BYTES
+    paths = sorted(folder.glob("*.mp4"))
+    for path in paths:
+        left -= path.stat().st_size
+        if left >= 0:
+            blocks.append(page.video(path.stem, path.read_bytes()))
+    more = len(paths) - len(blocks)
+    note = f'<p class="soft">{more} more in the folder videos/.</p>' if more else ""
+    return (page.grid(blocks, "small") if blocks else "") + note
 
 
 def _failures(rows: Sequence[TrialRow]) -> str:
@@ -518,60 +402,157 @@ def _failure(row: TrialRow) -> str:
     )
 
 
-def _comparison_table(runs: Mapping[str, Run]) -> str:
-    """A row per run and policy; a run without trials has one row."""
-    metrics = (*FLOW, CONTACT, SUCCESS, DISTANCE, MOTION_ONLY)
-    head = '<th class="text">run</th><th class="text">policy</th><th>n</th>'
-    head += "".join(f"<th>{metric.label}</th>" for metric in metrics)
+# ------------------------------------------------------------------------------------------------------ comparison
+
+
+def _title(found: Comparison) -> str:
+    count = sum(len(group.names) for group in found.groups)
+    return f"Comparison of {count} run{'s' * (count != 1)}"
+
+
+def _left_out(unfinished: Sequence[Path]) -> str:
+    if not unfinished:
+        return ""
+    names = ", ".join(path.name for path in unfinished)
+    return f'<p class="error">Left out, not finished (no summary.json): {text(names)}</p>'
+
+
+def _cell(value: str, small: str = "") -> str:
+    return f"<td>{value}<small>{small}</small></td>"
+
+
+def _plain_table(head: Sequence[str], body: str) -> str:
+    """A table of which the first column is text."""
+    first, *others = head
+    cells = f'<th class="text">{text(first)}</th>' + "".join(f"<th>{text(name)}</th>" for name in others)
+    return f'<div class="panel wide"><table><thead><tr>{cells}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _named(label: str, colors: Mapping[str, str]) -> str:
+    return f'<td class="text named">{page.swatch(colors[label])}{text(label)}</td>'
+
+
+def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> str:
+    """A row per policy; of one split, or of all trials."""
+    numbers = found.numbers["by_split"][split] if split else found.numbers
+    entries = [entry for entry in found.entries if f"{entry.label}/n" in numbers]
+    if not entries:
+        return ""
+    several = not split and any(len(entry.seeds) > 1 for entry in entries)
+    labelled = not split and any(entry.labels is not None for entry in entries)
+    head = ["policy", "success", "success, class mean"] + ["success, range over seeds"] * several
+    head += ["contact", "normalized distance"] + ["labels", "expert steps"] * labelled
     body = ""
-    for name, run in runs.items():
-        for k, policy in enumerate(tables.policies_of(run.summary) or [""]):
-            prefix = f"{policy}/"
-            cells = f"<td>{text(run.summary.get(prefix + 'n', '–'))}</td>"
-            for metric in metrics:
-                key = metric.key if metric in FLOW else prefix + metric.key
-                # The flow belongs to the run: it stands in the first of its rows only.
-                hidden = metric in FLOW and k > 0
-                value = "" if hidden else metric.show(run.summary.get(key))
-                interval = "" if hidden else metric.show_interval(run.summary.get(f"{key}_ci95"))
-                cells += f"<td>{value}<small>{interval}</small></td>"
-            body += (
-                f'<tr class="mean"><td class="text">{text(name) if k == 0 else ""}</td>'
-                f'<td class="text">{text(policy)}</td>{cells}</tr>'
-            )
-    return f'<div class="panel wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    for entry in entries:
+        body += f'<tr class="mean">{_named(entry.label, colors)}'
+        body += _cell(*comparison.cells(entry, numbers, SUCCESS))
+        body += _cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean"))
+        if several:
+            body += _cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–")
+        body += _cell(*comparison.cells(entry, numbers, CONTACT)) + _cell(*comparison.cells(entry, numbers, DISTANCE))
+        if labelled:
+            body += _cell(comparison.show_labels(entry.labels)) + _cell(comparison.show_share(entry.expert_share))
+        body += "".join(f"<td>{numbers[f'{entry.label}/{key}']}</td>" for key in ("n", "n_objects"))
+        body += f"<td>{text(comparison.show_seeds(entry))}</td>"
+        body += "</tr>"
+    note = "" if split else '<p class="soft">Small print: 95 % intervals from resampling objects, see below.</p>'
+    return note + _plain_table([*head, "trials", "objects", "seeds"], body)
 
 
-def _comparison_bars(runs: Mapping[str, Run]) -> str:
-    """Success of each run's policies and the flow's cosine, instance and class mean."""
-    bars: dict[Metric, list[tuple[str, Mapping[str, Any], str]]] = {SUCCESS: [], DISTANCE: [], FLOW[0]: []}
-    for name, run in runs.items():
-        if tables.has_flow(run.summary):
-            bars[FLOW[0]].append((name, run.summary, FLOW[0].key))
-        for policy in tables.policies_of(run.summary):
-            for metric in (SUCCESS, DISTANCE):
-                bars[metric].append((f"{name} · {policy}", run.summary, f"{policy}/{metric.key}"))
+def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
+    splits = found.numbers.get("by_split", {})
+    return "".join(f"<h3>Split {text(name)}</h3>{_entry_table(found, colors, name)}" for name in splits)
+
+
+def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
+    """Instance means in the policies' colours."""
     blocks = []
-    for metric, entries in bars.items():
-        if not entries:
-            continue
+    for metric in (SUCCESS, DISTANCE) if found.entries else ():
         plot = go.Figure()
-        labels = [label for label, _, _ in entries]
-        for i, (title, suffix) in enumerate((("instance mean", ""), ("class mean", "_class_mean"))):
-            cells = [(n.get(key + suffix), n.get(f"{key}{suffix}_ci95")) for _, n, key in entries]
-            _bars(plot, title, _color(i), labels, cells)
+        for entry in found.entries:
+            key = f"{entry.label}/{metric.key}"
+            value = (found.numbers.get(key), found.numbers.get(f"{key}_ci95"))
+            _bars(plot, entry.label, colors[entry.label], [_broken(entry.label)], [value])
         plot.update_layout(
             template="none",
-            barmode="group",
-            bargap=0.3,
-            height=110 + 42 * len(entries),
-            margin={"l": 8, "r": 16, "t": 34, "b": 40},
-            legend={"orientation": "h", "y": 1, "yanchor": "bottom", "traceorder": "normal"},
+            barmode="overlay",
+            bargap=0.4,
+            height=70 + 34 * len(found.entries),
+            margin={"l": 8, "r": 16, "t": 12, "b": 40},
+            showlegend=False,
             xaxis={
-                "tickformat": ".0%" if metric.percent else ".2f",
+                "tickformat": ".0%" if metric.percent else ".1f",
+                "rangemode": "tozero",
                 "title": {"text": f"{metric.label}, with 95 % interval"},
             },
             yaxis={"autorange": "reversed", "automargin": True, "ticksuffix": "  "},
         )
-        blocks.append(page.figure(metric.key.replace("/", "-"), plot))
-    return "".join(f'<div style="margin-bottom:12px">{block}</div>' for block in blocks)
+        if metric.percent:
+            plot.update_xaxes(range=[0, 1.02])
+        blocks.append(page.figure(metric.key, plot))
+    return page.grid(blocks) if blocks else ""
+
+
+def _broken(label: str) -> str:
+    """A long label on several lines, which leaves the bars their room on a phone."""
+    return "\n".join(textwrap.wrap(label, 24))
+
+
+def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:
+    bodies: dict[str, str] = {}
+    for three in comparison.by_pair(found):
+        row = f'<tr class="mean">{_named(three[0].entry.label, colors)}{_cell(str(three[0].n))}'
+        row += "".join(_cell(*comparison.show_difference(d.metric, d.means)) for d in three)
+        bodies[three[0].baseline.label] = bodies.get(three[0].baseline.label, "") + row + "</tr>"
+    head = ("policy", "trials", *(m.label + ", points" * m.percent for m in comparison.DIFFERENCES))
+    return "".join(f"<h3>Minus {text(name)}</h3>{_plain_table(head, body)}" for name, body in bodies.items())
+
+
+def _entry_categories(found: Comparison, colors: Mapping[str, str]) -> str:
+    if not found.entries:
+        return ""
+    body = ""
+    for category, values in found.numbers["by_category"].items():
+        shown = (comparison.cells(entry, values, SUCCESS) for entry in found.entries)
+        objects = {(r.category, r.object) for e in found.entries for r in e.rows.values() if r.category == category}
+        cells = _cell(str(len(objects))) + "".join(_cell(*cell) for cell in shown)
+        body += f'<tr class="mean"><td class="text">{text(category)}</td>{cells}</tr>'
+    head = "".join(
+        f'<th class="group" style="--swatch:{colors[entry.label]}">{text(entry.label)}</th>' for entry in found.entries
+    )
+    head = f'<th class="text">category</th><th>objects</th>{head}'
+    return f'<div class="panel wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _flow_table(found: Comparison) -> str:
+    """A row per group that measured a flow network, all seeds together."""
+    body = ""
+    for group in found.groups:
+        rows = [row for run in group.runs for row in run.flow]
+        if not rows:
+            continue
+        cells = _cell(str(sum(bool(run.flow) for run in group.runs))) + _cell(str(len(rows)))
+        for metric in FLOW:
+            measured = tables.measure(rows, metric)
+            cells += _cell(metric.show(measured.instance), metric.show_interval(measured.instance_ci95))
+            cells += _cell(metric.show(measured.class_), metric.show_interval(measured.class_ci95))
+        body += f'<tr class="mean"><td class="text">{text(group.label)}</td>{cells}</tr>'
+    names = (metric.label.removeprefix("flow ") for metric in FLOW)
+    head = ["run", "seeds", "clouds", *(cell for name in names for cell in (name, f"{name}, class mean"))]
+    return _plain_table(head, body) if body else ""
+
+
+def _told(found: Comparison) -> str:
+    labelled = any(entry.labels is not None for entry in found.entries)
+    terms = _terms([run.summary for group in found.groups for run in group.runs])
+    return page.facts([*terms, *(entry for entry in comparison.METHOD if entry[0] != "Labels" or labelled)])
+
+
+def _group_facts(group: Group) -> str:
+    """What was run, told once where all runs of the group agree."""
+    facts: list[tuple[str, object]] = [("Runs", ", ".join(group.names))]
+    for key, label in _FACTS.items():
+        values = dict.fromkeys(str(run.summary[key]) for run in group.runs if run.summary.get(key) not in (None, ""))
+        if values:
+            facts.append((label, ", ".join(values) if key in ("seed", "git_revision") else " | ".join(values)))
+    return f"<h3>{text(group.label)}</h3>{page.facts(facts)}"

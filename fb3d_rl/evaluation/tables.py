@@ -154,16 +154,42 @@ def _percentiles(statistic: NDArray[np.float64]) -> Interval:
     return float(low), float(high)
 
 
-def _objects(
-    rows: Iterable[TrialRow | FlowRow], value_of: Callable[[Any], float | None]
-) -> dict[tuple[str, str], float]:
-    """Mean value of each (category, object), sorted: no result depends on the order of rows."""
+def _objects(values: Iterable[tuple[str, str, float | None]]) -> dict[tuple[str, str], float]:
+    """Mean value of each (category, object), sorted: no result depends on the order of rows. None does not count."""
     collected: dict[tuple[str, str], list[float]] = {}
-    for row in rows:
-        value = value_of(row)
+    for category, object_, value in values:
         if value is not None:
-            collected.setdefault((row.category, row.object), []).append(value)
+            collected.setdefault((category, object_), []).append(value)
     return {key: math.fsum(collected[key]) / len(collected[key]) for key in sorted(collected)}
+
+
+def measure(rows: Iterable[TrialRow] | Iterable[FlowRow], metric: Metric) -> Means:
+    """Means of ``metric`` over the objects of ``rows``, all rows of an object together."""
+    value_of = _VALUES[metric.key]
+    return means(_objects((row.category, row.object, value_of(row)) for row in rows), metric.proportion)
+
+
+def difference(pairs: Iterable[tuple[TrialRow, TrialRow]], metric: Metric) -> Means:
+    """Means of the first row's minus the second row's value, over the objects of ``pairs``.
+
+    An object's value is the mean over its pairs; the interval comes from resampling objects, so that what makes
+    an object hard for both rows of a pair cancels. There is none where all objects differ by the same.
+
+    Args:
+        pairs: two policies' rows of one trial each; pairs of which either value is undefined do not count.
+        metric: any of :data:`TRIAL`.
+
+    Raises:
+        ValueError: the rows of a pair are of two objects.
+    """
+    value_of = _VALUES[metric.key]
+    values = []
+    for row, other in pairs:
+        if (row.category, row.object) != (other.category, other.object):
+            raise ValueError(f"a pair of {row.category} {row.object} and {other.category} {other.object}")
+        one, two = value_of(row), value_of(other)
+        values.append((row.category, row.object, None if one is None or two is None else one - two))
+    return means(_objects(values), proportion=False)
 
 
 def _measure(
@@ -171,8 +197,7 @@ def _measure(
 ) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for metric in metrics:
-        values = _objects(rows, _VALUES[metric.key])
-        result = means(values, metric.proportion)
+        result = measure(rows, metric)
         key = prefix + metric.key
         out[key] = result.instance
         out[f"{key}_ci95"] = None if result.instance_ci95 is None else list(result.instance_ci95)

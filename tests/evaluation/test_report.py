@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import base64
 import json
 import os
 import re
@@ -13,8 +14,11 @@ import numpy as np
 import pytest
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation import report
+from fb3d_rl.evaluation.comparison import compare
 from fb3d_rl.evaluation.report import write_comparison, write_report
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.runs import read_run
 from fb3d_rl.evaluation.tables import summary
 
 ROOT = Path(__file__).parents[2]
@@ -187,6 +191,22 @@ def test_without_a_summary_it_is_computed_from_the_rows(run: Path, tmp_path: Pat
     assert f"{len(rows) // 2} trials on 7 objects, 1 crashed" in numbers
 
 
+def test_videos_stand_inside_the_page_while_they_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path / "run")
+    (tmp_path / "run" / "videos").mkdir()
+    for name in ("000_b", "000_a", "001_c"):
+        (tmp_path / "run" / "videos" / f"{name}.mp4").write_bytes(name.encode() * 20)
+    monkeypatch.setattr(report, "_VIDEO_BYTES", 250)
+    page = Page(write_report(tmp_path / "run"))
+    sources = [attrs["src"] for tag, attrs in page.tags if tag == "video"]
+    held = [base64.b64decode((source or "").removeprefix("data:video/mp4;base64,")) for source in sources]
+    assert held == [b"000_a" * 20, b"000_b" * 20]
+    shown = " ".join(page.text)
+    assert "000_a" in shown and "1 more" in shown
+    policy = next(attrs["content"] for tag, attrs in page.tags if tag == "meta" and "http-equiv" in attrs)
+    assert policy is not None and "media-src data:" in policy
+
+
 def test_writing_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
     assert write_report(run, tmp_path / "again.html").read_bytes() == (run / "report.html").read_bytes()
 
@@ -194,15 +214,17 @@ def test_writing_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
 def test_comparison_names_every_run_and_policy(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "a" / "first"
     fill(other)
-    compared = Page(write_comparison([run, other], tmp_path / "out" / "comparison.html"))
+    (other / "config.yaml").write_text("name: other\n")
+    found = compare([read_run(run), read_run(other)])
+    compared = Page(write_comparison(found, tmp_path / "out" / "comparison.html"))
     shown = " ".join(compared.text)
-    for label in (f"{run.parent.name}/first", "a/first"):
+    for label in (f"{run.parent.name}/first", "a/first", "artflownet · name=other"):
         assert label in shown
-    assert shown.count("artflownet") >= 2
+    assert "0.80" in shown, "the flow's cosine"
     figure = json.dumps(compared.json_of("data-figure", "success_rate"))
-    assert "a/first \\u00b7 artflownet" in figure
+    assert "name=&lt;scrip<br>" in figure and "<scrip" not in figure
     with pytest.raises(UserError, match="twice"):
-        write_comparison([run, run], tmp_path / "comparison.html")
+        compare([read_run(run), read_run(run)])
 
 
 def test_command_line(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

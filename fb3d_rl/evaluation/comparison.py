@@ -1,0 +1,479 @@
+"""Several runs as one comparison: groups of seeds, repeated baselines counted once, paired differences.
+
+Definitions
+    A *group* is runs whose configurations are equal but for the seed. A second run of a group's seed is left out
+    if its rows are equal, and starts a group of its own if they are not.
+    An *entry* is one row of the comparison: a policy with its trials of all seeds. The policy that a run is about
+    is an entry of its group. Other policies of a run (the expert, a given ArtFlowNet) are repeated by many runs:
+    they are one entry with those of another group if both have trials in common (same seed, object, part and
+    view) and every one of these ended alike; what ended otherwise stands apart under the name of its group.
+
+Intervals
+    As in :mod:`fb3d_rl.evaluation.tables`: objects are resampled, and all trials of an object, those of all seeds,
+    stay together, since several seeds on the same objects are no more objects. Differences are taken trial by
+    trial between policies that ran the same trials, and objects are resampled likewise.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from fb3d_rl.evaluation import learning, tables
+from fb3d_rl.evaluation.rows import TrialRow, policies, write_text
+from fb3d_rl.evaluation.runs import Run, labels
+from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, SUCCESS, TRIAL, Means, Metric
+
+METHOD = (
+    ("Interval", "95 %: objects are resampled (bootstrap, 2000 times) and all trials of an object, over all seeds, "
+     "stay together. It tells how the mean would vary with other objects, for the networks as they were trained; "
+     "how it varies with training is the range over seeds."),
+    ("Range over seeds", "the lowest and the highest seed's instance mean."),
+    ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
+     "a policy whose repeats differ stands in several rows."),
+    ("Difference", "between two policies on the trials that both ran (same seed, object, part and view), trial by "
+     "trial, as a mean over objects; its interval resamples objects likewise. There is none if all objects differ "
+     "by the same."),
+    ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
+     "those steps in which the expert also acted."),
+)  # fmt: skip
+"""How the numbers of a comparison come about: (term, meaning)."""
+
+BASELINES = ("expert", "bc")
+"""Policies that the others are compared with."""
+
+DIFFERENCES = (SUCCESS, CONTACT, DISTANCE)
+
+COLUMNS = ("policy", "seed", "split", "category", "metric", "value", "low", "high", "n")
+"""Columns of comparison.csv."""
+
+_NOT_COMPARED = ("seed", "resume")
+_MAX_KEYS = 3
+"""Settings in a label; runs that differ in more are told apart by their folders."""
+
+TrialKey = tuple[int | None, str, str, str, str, int, int]
+"""Run seed, split, category, object, link, trial seed, and the how manyth of these."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs that differ only in the seed.
+
+    Attributes:
+        label: for people, unique.
+        policy: the policy that the runs are about.
+        runs: one for each seed.
+        settings: their configuration without the seed.
+        names: names of the runs' folders, those of left-out repeats included.
+    """
+
+    label: str
+    policy: str
+    runs: list[Run]
+    settings: Mapping[str, str]
+    names: list[str]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row of the comparison.
+
+    Attributes:
+        label: for people, unique.
+        policy: the policy's name in the rows.
+        own: the runs of the first group are about this policy.
+        groups: the groups whose runs have these trials.
+        rows: the trials, each once.
+    """
+
+    label: str
+    policy: str
+    own: bool
+    groups: list[Group]
+    rows: dict[TrialKey, TrialRow]
+
+    @property
+    def seeds(self) -> list[int | None]:
+        """Seeds of the runs, in order."""
+        return sorted({key[0] for key in self.rows}, key=lambda seed: -1 if seed is None else seed)
+
+    def of_seed(self, seed: int | None) -> list[TrialRow]:
+        """The trials of one seed."""
+        return [row for key, row in self.rows.items() if key[0] == seed]
+
+    def seed_range(self, metric: Metric) -> tuple[float, float] | None:
+        """Lowest and highest instance mean of a seed; None for a single seed."""
+        found = [tables.measure(self.of_seed(seed), metric).instance for seed in self.seeds]
+        known = [value for value in found if value is not None]
+        return (min(known), max(known)) if len(found) > 1 and known else None
+
+    @property
+    def logs(self) -> list[list[dict[str, Any]]]:
+        """Logs of the runs that made the policy."""
+        return [run.log for run in self.groups[0].runs] if self.own else []
+
+    @property
+    def labels(self) -> float | None:
+        """Labels used, mean over seeds."""
+        return _mean(learning.labels_used(log) for log in self.logs)
+
+    @property
+    def expert_share(self) -> float | None:
+        """Share of the collected steps in which the expert acted, mean over seeds."""
+        return _mean(learning.expert_share(log) for log in self.logs)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """An entry's mean minus a baseline's, on the trials of both.
+
+    Attributes:
+        entry: the one.
+        baseline: the other.
+        metric: what is compared.
+        means: of the differences.
+        n: trials that both ran.
+    """
+
+    entry: Entry
+    baseline: Entry
+    metric: Metric
+    means: Means
+    n: int
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What :func:`compare` finds; ``numbers`` is a :func:`fb3d_rl.evaluation.tables.summary` by entries' labels."""
+
+    groups: list[Group]
+    entries: list[Entry]
+    differences: list[Difference]
+    numbers: dict[str, Any]
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return math.fsum(known) / len(known) if known else None
+
+
+def compare(runs: Sequence[Run]) -> Comparison:
+    """Group, merge and pair the trials of ``runs``, as this module's docstring defines it.
+
+    Raises:
+        UserError: a run is given twice or its config.yaml cannot be read.
+    """
+    groups = _groups(runs)
+    entries = _entries(groups)
+    rows = [replace(row, policy=entry.label) for entry in entries for row in entry.rows.values()]
+    facts = {"policy": entries[0].label} if entries else {}
+    return Comparison(groups, entries, _differences(entries), tables.summary(rows, [], facts))
+
+
+# -------------------------------------------------------------------------------------------------------- grouping
+
+
+def _groups(runs: Sequence[Run]) -> list[Group]:
+    names = dict(zip((run.path for run in runs), labels([run.path for run in runs]), strict=True))
+    found: list[tuple[dict[str, str], list[Run], list[str]]] = []
+    for run in runs:
+        settings = {key: value for key, value in run.settings.items() if key not in _NOT_COMPARED}
+        for others, members, folders in found:
+            same = next((other for other in members if other.seed == run.seed), None)
+            fits = same is None or (same.rows == run.rows and same.flow == run.flow)
+            # Without a configuration nobody knows whether the seed is all that differs.
+            if settings and others == settings and fits:
+                members += [run] if same is None else []
+                folders.append(names[run.path])
+                break
+        else:
+            found.append((settings, [run], [names[run.path]]))
+    policies_ = [_about(members[0], settings, folders[0]) for settings, members, folders in found]
+    told = _labels(policies_, [settings for settings, _, _ in found], [folders[0] for _, _, folders in found])
+    return [
+        Group(label, policy, sorted(members, key=lambda run: -1 if run.seed is None else run.seed), settings, folders)
+        for label, policy, (settings, members, folders) in zip(told, policies_, found, strict=True)
+    ]
+
+
+def _about(run: Run, settings: Mapping[str, str], folder: str) -> str:
+    """The policy that a run is about, or the best name for a run without trials."""
+    found = run.summary.get("policy") or settings.get("algo.name") or settings.get("policy.name") or folder
+    return str(found)
+
+
+def _labels(names: Sequence[str], settings: Sequence[Mapping[str, str]], folders: Sequence[str]) -> list[str]:
+    """Each group's policy, where several share it with the settings in which they differ."""
+    out = []
+    for name, own, folder in zip(names, settings, folders, strict=True):
+        peers = [other for other, policy in zip(settings, names, strict=True) if policy == name]
+        keys = [key for key in sorted({k for p in peers for k in p}) if len({p.get(key) for p in peers}) > 1]
+        alike = sum(peer == own for peer in peers) > 1
+        if len(peers) == 1:
+            out.append(name)
+        elif len(keys) > _MAX_KEYS or alike:
+            out.append(f"{name} · {folder}")
+        else:
+            out.append(f"{name} · " + ", ".join(f"{key}={own.get(key, 'unset')}" for key in keys))
+    return out
+
+
+# --------------------------------------------------------------------------------------------------------- merging
+
+
+def _entries(groups: Sequence[Group]) -> list[Entry]:
+    found: list[tuple[str, bool, list[Group], dict[TrialKey, TrialRow]]] = []
+    parts = [(policy, group) for group in groups for policy in policies(row for run in group.runs for row in run.rows)]
+    # What a run is about comes first: a baseline may turn out to be the policy that another run trained.
+    for policy, group in sorted(parts, key=lambda part: part[0] != part[1].policy):
+        rows = _keyed(group, policy)
+        own = policy == group.policy
+        for known, _, members, merged in found:
+            if not own and known == policy and _repeats(rows, merged):
+                members.append(group)
+                merged.update(rows)
+                break
+        else:
+            found.append((policy, own, [group], rows))
+    count = Counter(policy for policy, *_ in found)
+    entries = []
+    for policy, own, members, rows in found:
+        apart = f"{policy} (in {members[0].label})" if count[policy] > 1 else policy
+        entries.append(Entry(members[0].label if own else apart, policy, own, members, rows))
+    first = {"expert": 0, "artflownet": 1}
+    place = {id(group): i for i, group in enumerate(groups)}
+    return sorted(entries, key=lambda entry: (first.get(entry.policy, 2), place[id(entry.groups[0])], not entry.own))
+
+
+def _keyed(group: Group, policy: str) -> dict[TrialKey, TrialRow]:
+    keyed: dict[TrialKey, TrialRow] = {}
+    for run in group.runs:
+        times: Counter[tuple[str, str, str, str, int]] = Counter()
+        for row in run.rows:
+            if row.policy == policy:
+                what = (row.split, row.category, row.object, row.link, row.seed)
+                keyed[(run.seed, *what, times[what])] = row
+                times[what] += 1
+    return keyed
+
+
+def _repeats(rows: Mapping[TrialKey, TrialRow], others: Mapping[TrialKey, TrialRow]) -> bool:
+    """Whether two tables have trials in common and all of these ended alike."""
+    common = rows.keys() & others.keys()
+    return bool(common) and all(_outcome(rows[key]) == _outcome(others[key]) for key in common)
+
+
+def _outcome(row: TrialRow) -> tuple[object, ...]:
+    return (row.status, row.contact, row.success, row.normalized_distance, row.steps, row.attach_step)
+
+
+# --------------------------------------------------------------------------------------------------------- pairing
+
+
+def _differences(entries: Sequence[Entry]) -> list[Difference]:
+    found = []
+    for name in reversed(BASELINES):
+        for entry in entries:
+            # The expert beside BC is BC beside the expert.
+            if entry.policy == name or (entry.policy in BASELINES and name != "expert"):
+                continue
+            for baseline in _nearest(entry, [other for other in entries if other.policy == name]):
+                pairs = [(row, baseline.rows[key]) for key, row in entry.rows.items() if key in baseline.rows]
+                found += [
+                    Difference(entry, baseline, metric, tables.difference(pairs, metric), len(pairs))
+                    for metric in DIFFERENCES
+                ]
+    return found
+
+
+def _nearest(entry: Entry, baselines: Sequence[Entry]) -> list[Entry]:
+    """Of those with trials in common, the baselines whose configuration is the nearest to the entry's."""
+
+    def distance(baseline: Entry) -> int:
+        return min(
+            sum(a.settings.get(key) != b.settings.get(key) for key in {*a.settings, *b.settings})
+            for a in entry.groups
+            for b in baseline.groups
+        )
+
+    known = {id(b): distance(b) for b in baselines if entry.rows.keys() & b.rows.keys()}
+    return [b for b in baselines if known.get(id(b), math.inf) == min(known.values(), default=-1)]
+
+
+# --------------------------------------------------------------------------------------------------------- writing
+
+
+def write_csv(comparison: Comparison, path: Path) -> None:
+    """Write every number of the comparison as a tidy table with :data:`COLUMNS`.
+
+    ``seed``, ``split`` and ``category`` are "all" or one of theirs. ``metric`` is a key of
+    :data:`fb3d_rl.evaluation.tables.TRIAL`, with "_class_mean" the mean over categories, with "_minus_<policy>"
+    the paired difference, or "labels" or "expert_share". ``low`` and ``high`` are the ends of the 95 % interval;
+    ``n`` counts trials.
+    """
+    out = io.StringIO(newline="")
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for entry in comparison.entries:
+        writer.writerows(_csv_rows(entry))
+    for d in comparison.differences:
+        about = (d.entry.label, "all", "all", "all")
+        writer.writerows(_means_rows(about, d.metric.key, f"_minus_{d.baseline.label}", d.means, d.n, classes=True))
+    write_text(path, out.getvalue())
+
+
+_CsvRow = tuple[object, ...]
+
+
+def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
+    seeds: list[tuple[str, list[TrialRow]]] = [("all", list(entry.rows.values()))]
+    if len(entry.seeds) > 1:
+        seeds += [(str(seed), entry.of_seed(seed)) for seed in entry.seeds]
+    for seed, of_seed in seeds:
+        for split, of_split in _parts(of_seed, "split"):
+            for category, rows in _parts(of_split, "category", single=True):
+                for metric in TRIAL:
+                    about = (entry.label, seed, split, category)
+                    counted = [row for row in rows if row.contact] if metric is tables.MOTION_ONLY else rows
+                    measured = tables.measure(rows, metric)
+                    yield from _means_rows(about, metric.key, "", measured, len(counted), classes=category == "all")
+    for key, values, total in (
+        ("labels", [learning.labels_used(log) for log in entry.logs], entry.labels),
+        ("expert_share", [learning.expert_share(log) for log in entry.logs], entry.expert_share),
+    ):
+        if total is not None:
+            yield (entry.label, "all", "all", "all", key, total, "", "", "")
+            for run, value in zip(entry.groups[0].runs if len(values) > 1 else [], values, strict=False):
+                yield (entry.label, run.seed, "all", "all", key, _plain(value), "", "", "")
+
+
+def _parts(rows: Sequence[TrialRow], field: str, single: bool = False) -> Iterator[tuple[str, list[TrialRow]]]:
+    """All rows, then those of each value of ``field``, which is left out if there is but one unless ``single``."""
+    yield "all", list(rows)
+    values = sorted({getattr(row, field) for row in rows})
+    for value in values if single or len(values) > 1 else []:
+        yield value, [row for row in rows if getattr(row, field) == value]
+
+
+def _means_rows(
+    about: tuple[str, str, str, str], key: str, suffix: str, found: Means, n: int, classes: bool
+) -> Iterator[_CsvRow]:
+    shown = [(key + suffix, found.instance, found.instance_ci95)]
+    if classes:
+        shown.append((f"{key}_class_mean{suffix}", found.class_, found.class_ci95))
+    for name, value, interval in shown:
+        yield (*about, name, _plain(value), *(interval or ("", "")), n)
+
+
+def _plain(value: float | None) -> object:
+    return "" if value is None else value
+
+
+# -------------------------------------------------------------------------------------------------------- printing
+
+
+def cells(entry: Entry, numbers: Mapping[str, Any], metric: Metric, suffix: str = "") -> tuple[str, str]:
+    """An entry's value and interval for people; ``numbers`` is a comparison's or one of its splits'."""
+    key = f"{entry.label}/{metric.key}{suffix}"
+    return metric.show(numbers.get(key)), metric.show_interval(numbers.get(f"{key}_ci95"))
+
+
+def show_seeds(entry: Entry) -> str:
+    """Seeds for people: "0, 2", "0–9"."""
+    known = [seed for seed in entry.seeds if seed is not None]
+    if len(known) > 3 and known == list(range(known[0], known[-1] + 1)):
+        return f"{known[0]}–{known[-1]}"
+    return ", ".join(map(str, known)) or "–"
+
+
+def show_labels(value: float | None) -> str:
+    """A number of labels for people."""
+    return "–" if value is None else f"{value:,.0f}"
+
+
+def show_share(value: float | None) -> str:
+    """A share in percent for people."""
+    return "–" if value is None else f"{100 * value:.0f} %"
+
+
+def show_difference(metric: Metric, found: Means) -> tuple[str, str]:
+    """A signed difference and its interval for people; percentages differ by points."""
+    if found.instance is None:
+        return "–", ""
+
+    def signed(value: float) -> str:
+        shown = f"{100 * value:+.0f}" if metric.percent else f"{value:+.2f}"
+        return shown.replace("-", "\N{MINUS SIGN}") if float(shown) else shown[1:]
+
+    interval = found.instance_ci95
+    return signed(found.instance), "" if interval is None else f"{signed(interval[0])} to {signed(interval[1])}"
+
+
+def show(comparison: Comparison, console: Console | None = None) -> None:
+    """Print the comparison, 100 columns wide where the output is not a terminal."""
+    console = console or Console()
+    if not console.is_terminal:
+        console.width = max(console.width, 100)
+    for table in _tables(comparison):
+        console.print(table)
+
+
+def _table(title: str, *columns: tuple[str, bool]) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for name, number in columns:
+        table.add_column(name, justify="right" if number else "left", overflow="fold")
+    return table
+
+
+def _tables(comparison: Comparison) -> Iterator[Table]:
+    splits: dict[str, Mapping[str, Any]] = {"": comparison.numbers, **comparison.numbers.get("by_split", {})}
+    names = ("seeds", "n", "contact", "success", "95 %", "over seeds", "class", "dist.", "labels", "expert")
+    for split, numbers in splits.items():
+        title = f"Comparison, {split}" if split else "Comparison"
+        table = _table(title, ("policy", False), *((name, True) for name in names))
+        for entry in comparison.entries:
+            if f"{entry.label}/n" not in numbers:
+                continue
+            spread = None if split else entry.seed_range(SUCCESS)
+            success, interval = cells(entry, numbers, SUCCESS)
+            table.add_row(
+                entry.label,
+                show_seeds(entry),
+                str(numbers[f"{entry.label}/n"]),
+                cells(entry, numbers, CONTACT)[0],
+                success,
+                interval,
+                SUCCESS.show_interval(spread),
+                cells(entry, numbers, SUCCESS, "_class_mean")[0],
+                cells(entry, numbers, DISTANCE)[0],
+                show_labels(entry.labels),
+                show_share(entry.expert_share),
+            )
+        if table.row_count:
+            yield table
+    table = _table(
+        "Differences on the same trials (success and contact in points)",
+        ("policy", False), ("minus", False), ("n", True), ("success", True), ("95 %", True), ("contact", True),
+        ("95 %", True), ("dist.", True), ("95 %", True),
+    )  # fmt: skip
+    for three in by_pair(comparison):
+        shown = (cell for d in three for cell in show_difference(d.metric, d.means))
+        table.add_row(three[0].entry.label, three[0].baseline.label, str(three[0].n), *shown)
+    if table.row_count:
+        yield table
+
+
+def by_pair(comparison: Comparison) -> list[list[Difference]]:
+    """The differences of each pair of entries, one for each of :data:`DIFFERENCES`."""
+    width = len(DIFFERENCES)
+    return [comparison.differences[i : i + width] for i in range(0, len(comparison.differences), width)]
