@@ -248,15 +248,16 @@ class FlowPolicy(TensorDictModuleBase):
         rows = _in_phase(memories, SELECT)
         if not rows:
             return
-        points, valid, part, camera, flow = (
-            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], flow)
+        tip = obs["tool_pose"][..., :3]
+        points, valid, part, camera, hand, flow = (
+            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], tip, flow)
         )
         flow = torch.where((part & valid)[..., None], flow, 0.0)
         avoid = torch.zeros_like(valid)
         for k, i in enumerate(rows):
             for tried in torch.from_numpy(memories[i].tried[: memories[i].tries]).to(points):
                 avoid[k] |= (points[k] - tried).norm(dim=-1) < self.options.retry_distance
-        chosen = choose_contact(points, valid, part, flow, camera, avoid, self.options.contact)
+        chosen = choose_contact(points, valid, part, flow, camera, hand, avoid, self.options.contact)
         for i, *found in zip(rows, *map(_numbers, chosen), strict=True):
             memory = memories[i]
             memory.contact_point, memory.pull, memory.standoff = found

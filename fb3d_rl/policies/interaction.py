@@ -11,7 +11,13 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from fb3d_rl.contract import Key, UserError
-from fb3d_rl.policies.flow_policy import RELEASE, RETREAT, SELECT, FlowPolicy
+from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowPolicy
+
+CHOOSE_AGAIN = 8
+"""Steps after which an expert that looks on chooses the contact point again while the hand is on its way."""
+
+ASTRAY = 0.1
+"""Distance (m) from the approach line at which it gives up the line."""
 
 
 class Gate(nn.Module):
@@ -146,8 +152,7 @@ class HumanGate(Gate):
 class InteractivePolicy(TensorDictModuleBase):
     """Expert and learner in one: ("expert", "action") is always the expert's label, "action" that of whoever acts.
 
-    The expert goes along in its own state while the learner acts. It knows then that what happens is not its doing:
-    it does not count steps without progress as failed attempts, and after a lost hold it chooses a contact anew.
+    The expert goes along in its own state while the learner acts, see :meth:`look_on`.
 
     Args:
         expert: the flow policy with the true flow.
@@ -169,7 +174,8 @@ class InteractivePolicy(TensorDictModuleBase):
             if both:
                 raise ValueError(f"expert and learner both write {sorted(both, key=str)}")
             own.update(learner.out_keys)
-        self.in_keys = [key for key in dict.fromkeys(keys) if key not in own] + [("expert", "looks_on")]
+        keys += [("expert", "looks_on"), "elapsed_steps"]
+        self.in_keys = [key for key in dict.fromkeys(keys) if key not in own]
         self.out_keys = ["action", ("expert", "action"), ("expert", "acts"), ("next", "expert", "looks_on")]
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
@@ -199,8 +205,19 @@ class InteractivePolicy(TensorDictModuleBase):
 
     @staticmethod
     def look_on(tensordict: TensorDictBase) -> None:
-        """Keep the expert from drawing conclusions from steps that the learner made."""
+        """Keep the expert from drawing conclusions from steps that the learner made, and from insisting on its plan.
+
+        A learner cannot see which contact point the expert chose long ago, from elsewhere. So a label depends on what
+        can be seen: on the way the point is chosen again and again, from where the hand is by now.
+        """
         looks_on, state = tensordict["expert", "looks_on"], tensordict["policy"]
+        if not bool(looks_on.any()):
+            return
         state["idle"] = torch.where(looks_on, 0, state["idle"])
         away = (state["phase"] == RETREAT) | (state["phase"] == RELEASE)
-        state["phase"] = torch.where(looks_on & away, SELECT, state["phase"])
+        tip = tensordict["observation", "tool_pose"][..., :3]
+        offset, standoff = tip - state["contact_point"], state["standoff"]
+        sideways = offset - (offset * standoff).sum(-1, keepdim=True) * standoff
+        astray = (state["phase"] == APPROACH) & (sideways.norm(dim=-1, keepdim=True) > ASTRAY)
+        due = (state["phase"] == TRAVEL) & (tensordict["elapsed_steps"] % CHOOSE_AGAIN == 0)
+        state["phase"] = torch.where(looks_on & (away | astray | due), SELECT, state["phase"])

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from fb3d_rl.contract import Key, UserError
+from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
@@ -26,9 +27,9 @@ from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, jo
 TWIST = 6
 """Tip velocity and turning of the hand in the world, each as a share of the gripper's limit."""
 
-VECTORS, SCALARS = 3, 3
-FELT = 3 * VECTORS + SCALARS
-"""What the hand feels: its axis, its tip's velocity and its turning (all in the world); held, force, tip's height."""
+FELT = 4 * 3 + 3
+"""What goes with a cloud: the hand's axis, its tip's velocity, the direction to the camera and the hand's turning, all in
+the world; held, force, height of the tip."""
 
 INPUTS = ("points", "features", "valid", "felt")
 """Entries of what the network sees."""
@@ -38,7 +39,17 @@ FULL_FORCE = 50.0
 
 SEEN: tuple[Key, ...] = tuple(
     ("observation", key)
-    for key in ("points", "valid", "part_mask", "qpos", "qvel", "tool_pose", "attached", "contact_force")
+    for key in (
+        "points",
+        "valid",
+        "part_mask",
+        "qpos",
+        "qvel",
+        "tool_pose",
+        "attached",
+        "contact_force",
+        "camera_position",
+    )
 )
 """What every learner reads."""
 
@@ -262,11 +273,10 @@ def feel(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:
     hand = hand_axis(obs["tool_pose"])
     velocity, angular = hand_velocities(obs, hand, obs["qvel"])
     force = (obs["contact_force"] / FULL_FORCE).clamp(max=1.0)
-    height = obs["tool_pose"][..., 2:3]
-    return torch.cat(
-        [hand, velocity / limits.linear, angular / limits.angular, obs["attached"].to(force.dtype), force, height],
-        dim=-1,
-    )
+    tip, held = obs["tool_pose"][..., :3], obs["attached"].to(force.dtype)
+    camera = normalize(obs["camera_position"] - tip)
+    own = [hand, velocity / limits.linear, camera, angular / limits.angular, held, force, tip[..., 2:]]
+    return torch.cat(own, dim=-1)
 
 
 def history_of(felt: Tensor, count: int) -> Tensor:
@@ -306,7 +316,7 @@ def turned(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Te
     features, felt = inputs["features"], inputs["felt"]
     if features.shape[-1] > 1:
         features = torch.cat([features[..., :1], turn(features[..., 1:])], dim=-1)
-    felt = torch.cat([turn(felt[..., :3]), turn_pair(felt[..., 3:9]), felt[..., 9:]], dim=-1)
+    felt = torch.cat([turn(felt[..., :3]), turn(felt[..., 3:6]), turn_pair(felt[..., 6:12]), felt[..., 12:]], dim=-1)
     points = turn(inputs["points"])
     result = TensorDict(
         {"points": points, "features": features, "valid": inputs["valid"], "felt": felt}, inputs.batch_size

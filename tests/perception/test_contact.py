@@ -24,6 +24,7 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
         flow.norm(dim=-1) > 0,
         flow,
         camera,
+        camera,
         nobody if avoid is None else avoid,
         ContactOptions(**options),
     )
@@ -92,6 +93,7 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
         valid,
         flow,
         torch.tensor([[-3.0, 0.0, 1.0]]),
+        torch.tensor([[-3.0, 0.0, 1.0]]),
         torch.zeros_like(valid),
         ContactOptions(min_flow=0.0),
     )
@@ -106,7 +108,7 @@ def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_l
     camera = torch.tensor([[-3.0, 0.0, 4.0]])
     valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
     contact, direction, standoff = choose_contact(
-        cloud, valid, flow.norm(dim=-1) > 0, flow, camera, torch.zeros_like(valid), ContactOptions()
+        cloud, valid, flow.norm(dim=-1) > 0, flow, camera, camera, torch.zeros_like(valid), ContactOptions()
     )
     assert torch.allclose(direction[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
     assert torch.allclose(standoff, torch.nn.functional.normalize(camera - contact), atol=1e-4)
@@ -118,7 +120,9 @@ def test_the_hand_does_not_come_from_below_the_ground(height: float) -> None:
     flow = torch.tensor([0.0, 0.0, -1.0]).expand_as(points).clone()
     camera = torch.tensor([[-3.0, 0.0, 0.05]])  # seen from below
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
-    _, _, standoff = choose_contact(points, valid, valid, flow, camera, torch.zeros_like(valid), ContactOptions())
+    _, _, standoff = choose_contact(
+        points, valid, valid, flow, camera, camera, torch.zeros_like(valid), ContactOptions()
+    )
     assert standoff[0, 2] > -0.1
 
 

@@ -21,7 +21,7 @@ from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Workers
-from fb3d_rl.evaluation.rollout import policy_env
+from fb3d_rl.evaluation.rollout import policy_env, state_of
 from fb3d_rl.policies.flow_policy import (
     APPROACH,
     PULL,
@@ -257,7 +257,7 @@ def trials(microwave: ArticulatedObject) -> list[Trial]:
 
 
 def create(obj: ArticulatedObject, policy: TensorDictModuleBase) -> EnvBase:
-    return policy_env(make_env([obj], OPTIONS), policy)
+    return policy_env(make_env([obj], OPTIONS), state_of(policy))
 
 
 def rounds(
