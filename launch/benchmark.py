@@ -1,6 +1,6 @@
 """Measure throughput as ratios in one run on the same work; prints a table and writes JSON.
 
-python launch/benchmark.py                        control steps, labels, workers, loading, a soak test; procedural objects
+python launch/benchmark.py                        steps, labels, workers, loading, a soak test; procedural objects
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
 """
 

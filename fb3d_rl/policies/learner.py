@@ -28,8 +28,8 @@ TWIST = 6
 """Tip velocity and turning of the hand in the world, each as a share of the gripper's limit."""
 
 FELT = 4 * 3 + 3
-"""What goes with a cloud: the hand's axis, its tip's velocity, the direction to the camera and the hand's turning, all in
-the world; held, force, height of the tip."""
+"""What goes with a cloud: the hand's axis, its tip's velocity, the direction to the camera and the hand's turning, all
+in the world; held, force, height of the tip."""
 
 INPUTS = ("points", "features", "valid", "felt")
 """Entries of what the network sees."""

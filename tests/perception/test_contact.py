@@ -132,6 +132,21 @@ def test_leaves_a_point_whose_way_is_blocked_for_one_that_can_be_moved() -> None
     post[..., 0], post[..., 1], post[..., 2] = -0.75, -0.1, torch.linspace(0.4, 1.6, 40)
     cloud = torch.cat([points, post], dim=1)
     flow = torch.cat([hinge_flow(points), torch.zeros(1, 40, 3)], dim=1)
-    free, _, _ = choose(points, hinge_flow(points))
-    contact, _, _ = choose(cloud, flow)
+    free, _, _ = choose(points, hinge_flow(points), near=0.0)
+    contact, _, _ = choose(cloud, flow, near=0.0)
     assert contact[0, 1] > free[0, 1] + 0.1, "nearer to the hinge than without the post"
+
+
+def test_of_points_that_move_alike_the_one_near_the_hand_is_chosen_but_no_near_one_that_moves_less() -> None:
+    points = plate()
+    valid, camera = torch.ones(points.shape[:2], dtype=torch.bool), torch.tensor([[-3.0, 0.0, 1.0]])
+    nobody = torch.zeros_like(valid)
+    drawer = torch.tensor([-1.0, 0.0, 0.0]).expand_as(points)
+    for side in (-1.0, 1.0):
+        hand = torch.tensor([[-0.5, side, 0.5]])
+        contact, _, _ = choose_contact(points, valid, valid, drawer, camera, hand, nobody, ContactOptions())
+        assert side * contact[0, 1] > 0
+        flow = hinge_flow(points)
+        door, _, _ = choose_contact(points, valid, valid, flow, camera, hand, nobody, ContactOptions())
+        largest = flow.norm(dim=-1).amax()
+        assert flow[(points == door[:, None]).all(-1)].norm() > 0.8 * largest

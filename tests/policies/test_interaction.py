@@ -149,15 +149,37 @@ def test_a_learner_that_would_write_the_experts_state_is_refused() -> None:
         InteractivePolicy(expert_policy(LIMITS), learner, BetaGate())
 
 
-def test_the_expert_draws_no_conclusions_from_the_learners_steps_in_that_environment() -> None:
-    phases = torch.tensor([SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE]).repeat(2)[:, None]
-    td = TensorDict({"policy": FlowPolicy.initial_state((12,))}, batch_size=[12])
-    td["policy", "phase"], td["policy", "idle"] = phases, torch.full((12, 1), 5)
-    td["expert", "looks_on"] = torch.tensor([False] * 6 + [True] * 6)[:, None]
+def looking_on(phases: list[int], step: int, sideways: float) -> TensorDict:
+    """Environments in the given phases twice: where the expert acted before, then where it looked on.
+
+    The tip is 0.3 m before the contact point and ``sideways`` (m) off the approach line.
+    """
+    count = 2 * len(phases)
+    td = TensorDict({"policy": FlowPolicy.initial_state((count,))}, batch_size=[count])
+    td["policy", "phase"], td["policy", "idle"] = torch.tensor(phases * 2)[:, None], torch.full((count, 1), 5)
+    td["policy", "standoff"] = torch.tensor([-1.0, 0.0, 0.0]).expand(count, 3).clone()
+    td["observation", "tool_pose"] = torch.tensor([-0.3, sideways, 0.0, 1.0, 0.0, 0.0, 0.0]).expand(count, 7)
+    td["elapsed_steps"] = torch.full((count, 1), step)
+    td["expert", "looks_on"] = (torch.arange(count) >= len(phases))[:, None]
+    return td
+
+
+@pytest.mark.parametrize(
+    ("step", "sideways", "after"),
+    [
+        (3, 0.0, [SELECT, TRAVEL, APPROACH, PULL, SELECT, SELECT]),
+        (8, 0.0, [SELECT, SELECT, APPROACH, PULL, SELECT, SELECT]),
+        (3, 0.2, [SELECT, TRAVEL, SELECT, PULL, SELECT, SELECT]),
+    ],
+)
+def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(
+    step: int, sideways: float, after: list[int]
+) -> None:
+    phases = [SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE]
+    td = looking_on(phases, step, sideways)
     before = td["policy"].clone()
     InteractivePolicy.look_on(td)
-    expected = [SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE] + [SELECT, TRAVEL, APPROACH, PULL, SELECT, SELECT]
-    assert td["policy", "phase"].flatten().tolist() == expected
+    assert td["policy", "phase"].flatten().tolist() == phases + after
     assert td["policy", "idle"].flatten().tolist() == [5] * 6 + [0] * 6
     rest = [key for key in before.keys() if key not in ("phase", "idle")]
     assert (td["policy"].select(*rest) == before.select(*rest)).all()
