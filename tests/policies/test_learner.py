@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.objectives import BCLoss
+
+from fb3d_rl.contract import UserError
+from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.encoders import ENCODERS
+from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
+from fb3d_rl.policies.learner import (
+    FELT,
+    INPUTS,
+    Learner,
+    LearnerOptions,
+    feel,
+    history_of,
+    turned,
+    twist_of,
+)
+
+LIMITS = VelocityLimits(linear=2.0, angular=3.0)
+POINTS = 80
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def scene(count: int = 3, seed: int = 1) -> TensorDict:
+    """Observations with nothing at 0 and nothing aligned with an axis."""
+    g = generator(seed)
+    angles = torch.rand(count, 3, generator=g) - 0.5
+    position = torch.rand(count, 3, generator=g)
+    tool = torch.cat([position + 0.1, matrix_to_quaternion(euler_xyz_to_matrix(angles))], dim=-1)
+    flow = torch.randn(count, POINTS, 3, generator=g)
+    observation = {
+        "points": torch.rand(count, POINTS, 3, generator=g),
+        "valid": torch.rand(count, POINTS, generator=g) < 0.8,
+        "part_mask": torch.rand(count, POINTS, generator=g) < 0.5,
+        "camera_position": torch.randn(count, 3, generator=g) * 3,
+        "qpos": torch.cat([position, angles, torch.zeros(count, 2)], dim=-1),
+        "qvel": torch.randn(count, 8, generator=g),
+        "tool_pose": tool,
+        "attached": torch.rand(count, 1, generator=g) < 0.5,
+        "contact_force": 20 * torch.rand(count, 1, generator=g),
+    }
+    return TensorDict({"observation": observation, "privileged": {"flow": flow}}, batch_size=[count])
+
+
+def learner(**options: object) -> Learner:
+    small = {"points": 64, "width": 8, "history": 0, **options}
+    net = ArtFlowNet(generator=generator()) if options.get("flow") == "artflownet" else None
+    return Learner(LearnerOptions(**small), LIMITS, generator(), net).eval()  # type: ignore[arg-type]
+
+
+def act(policy: Learner, td: TensorDict) -> TensorDict:
+    return policy(td.clone().update(policy.initial_state(td.batch_size)))
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_the_action_depends_on_what_a_policy_should_depend_on(encoder: str) -> None:
+    policy, td = learner(encoder=encoder, flow="ground_truth"), scene(1)
+    action = act(policy, td)["action"]
+    assert action.shape == (1, 8) and bool((action.abs() <= 1).all()) and not action[:, 6:].any()
+    for key in ("part_mask", "attached"):
+        other = td.clone()
+        other["observation", key] = ~other["observation", key]
+        assert not torch.allclose(act(policy, other)["action"], action, atol=1e-7), key
+    for key in (("observation", "points"), ("observation", "qvel"), ("privileged", "flow")):
+        other = td.clone()
+        other[key] = other[key] * 0.7
+        assert not torch.allclose(act(policy, other)["action"], action, atol=1e-7), key
+    padding = ~td["observation", "valid"]
+    other = td.clone()
+    other["observation", "points"] = td["observation", "points"].masked_fill(padding[..., None], torch.nan)
+    assert torch.allclose(act(policy, other)["action"], action, atol=1e-6), "padding counts"
+    beyond = td.clone()
+    beyond["observation", "points"][:, 64:] += 1.0
+    assert torch.equal(act(policy, beyond)["action"], action), "points beyond options.points count"
+
+
+@pytest.mark.parametrize("encoder", ENCODERS)
+def test_a_batch_is_as_its_members_and_moving_the_scene_changes_nothing(encoder: str) -> None:
+    policy, td = learner(encoder=encoder), scene(3)
+    together = act(policy, td)["action"]
+    apart = torch.cat([act(policy, td[i : i + 1])["action"] for i in range(3)])
+    assert torch.allclose(together, apart, atol=1e-5)
+    shift = torch.tensor([0.7, -0.4, 0.0])  # the height above the ground is felt
+    moved = td.clone()
+    for key in ("points", "camera_position"):
+        moved["observation", key] = moved["observation", key] + shift
+    moved["observation", "qpos"][:, :3] += shift
+    moved["observation", "tool_pose"][:, :3] += shift
+    assert torch.allclose(act(policy, moved)["action"], together, atol=1e-4)
+
+
+def test_no_privileged_key_reaches_a_learner_that_does_not_declare_it() -> None:
+    for flow in ("none", "artflownet"):
+        policy = learner(flow=flow)
+        assert not [key for key in policy.in_keys if key[0] == "privileged"]
+        td = scene(2)
+        del td["privileged"]
+        act(policy, td)
+    declared = [key for key in learner(flow="ground_truth").in_keys if key[0] == "privileged"]
+    assert declared == [("privileged", "flow")]
+
+
+def test_a_predicted_flow_is_what_artflownet_says() -> None:
+    policy, td = learner(flow="artflownet"), scene(2)
+    net, obs = ArtFlowNet(generator=generator()).eval(), td["observation"]
+    with torch.no_grad():
+        expected = net(obs["points"], obs["valid"], obs["part_mask"])
+    assert torch.allclose(act(policy, td)["prediction", "flow"], expected, atol=1e-6)
+    policy.train()
+    assert policy.flow_network is not None and not policy.flow_network.training
+    assert not any(p.requires_grad for p in policy.flow_network.parameters())
+
+
+def test_the_twist_of_an_action_is_the_motion_that_makes_it() -> None:
+    td = scene(4)
+    hand = hand_axis(td["observation", "tool_pose"])
+    velocity = 0.3 * torch.randn(4, 3, generator=generator(2))
+    angular = 0.3 * torch.randn(4, 3, generator=generator(3))
+    angular = angular - (angular * hand).sum(-1, keepdim=True) * hand
+    action = joint_velocities(td["observation"], hand, velocity, angular, LIMITS)
+    twist = twist_of(td["observation"], action, LIMITS)
+    assert torch.allclose(twist[:, :3] * LIMITS.linear, velocity, atol=1e-4)
+    assert torch.allclose(twist[:, 3:] * LIMITS.angular, angular, atol=0.05)  # damped least squares
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_turned_situation_is_what_is_felt_in_the_turned_scene(mirrored: bool) -> None:
+    policy, td, angle = learner(flow="ground_truth", history=0), scene(1), 0.6
+    flip = torch.diag(torch.tensor([1.0, -1.0 if mirrored else 1.0, 1.0]))
+    turn = euler_xyz_to_matrix(torch.tensor([0.0, 0.0, angle])) @ flip
+    obs, other = td["observation"], td.clone()
+    for key in ("points", "camera_position"):
+        other["observation", key] = obs[key] @ turn.T
+    other["privileged", "flow"] = td["privileged", "flow"] @ turn.T
+    # The hand in the turned scene: the same axis turned, whatever the spin about it.
+    axis, tip = hand_axis(obs["tool_pose"]), obs["tool_pose"][:, :3]
+    inputs, twist = policy.look(td), torch.randn(1, 1, 6, generator=generator(5))
+    got, label = turned(inputs, twist, torch.tensor([angle]), torch.tensor([mirrored]))
+    sign = -1.0 if mirrored else 1.0
+    felt = inputs["felt"][0, 0]
+    assert torch.allclose(got["points"], (obs["points"][:, :64] - tip) @ turn.T, atol=1e-5)
+    assert torch.allclose(got["features"][..., 1:], other["privileged", "flow"][:, :64], atol=1e-5)
+    assert torch.equal(got["features"][..., 0], inputs["features"][..., 0])
+    assert torch.allclose(got["felt"][0, 0, :3], turn @ axis[0], atol=1e-5)
+    assert torch.allclose(got["felt"][0, 0, 9:12], sign * turn @ felt[9:12], atol=1e-5), "an axial vector"
+    assert torch.allclose(label[0, 0, :3], turn @ twist[0, 0, :3], atol=1e-6)
+    assert torch.allclose(label[0, 0, 3:], sign * turn @ twist[0, 0, 3:], atol=1e-6)
+    # omega x r is the velocity of a point: it has to turn and reflect as one, which fixes omega's sign.
+    arm = torch.tensor([0.2, -0.1, 0.4])
+    before = torch.linalg.cross(twist[0, 0, 3:], arm)
+    assert torch.allclose(torch.linalg.cross(label[0, 0, 3:], turn @ arm), turn @ before, atol=1e-5)
+
+
+def test_it_remembers_what_it_felt_as_training_rows_say() -> None:
+    policy, steps = learner(history=2), [scene(1, seed) for seed in range(4)]
+    state, remembered = policy.initial_state(torch.Size([1])), []
+    for td in steps:
+        td.update(state)
+        remembered.append(td["learner", "felt"].clone())
+        state = policy(td)["next"].select("learner")
+    felt = torch.cat([feel(td["observation"], LIMITS) for td in steps])
+    assert torch.allclose(torch.cat(remembered), history_of(felt, 2), atol=1e-6)
+    assert not remembered[0].any() and torch.allclose(remembered[3][0, 0], felt[2]) and felt.shape == (4, FELT)
+
+
+def test_a_plan_is_executed_step_by_step_before_it_looks_again() -> None:
+    policy, td = learner(chunk=4, execute=3), scene(1)
+    state, twists = policy.initial_state(torch.Size([1])), []
+    for seed in (1, 2, 3, 4):
+        td = scene(1, seed).update(state)
+        out = policy(td)
+        twists.append(twist_of(td["observation"], out["action"], LIMITS)[0, :3])
+        state = out["next"].select("learner")
+    inputs = policy.look(scene(1, 1))
+    plan = policy.network(*(inputs[key] for key in INPUTS))[0]
+    for k in range(3):
+        wanted = plan[k, :3] / max(1.0, float(plan[k, :3].detach().abs().max()))
+        assert torch.allclose(twists[k], wanted, atol=0.05)
+    again = policy.look(scene(1, 4))
+    assert torch.allclose(twists[3], policy.network(*(again[key] for key in INPUTS))[0, 0, :3], atol=0.05)
+
+
+@pytest.mark.parametrize("head", ["deterministic", "gaussian"])
+def test_torchrls_loss_fits_the_label(head: str) -> None:
+    policy = learner(head=head, width=16).train()
+    loss = BCLoss(policy.actor(), loss_function="l2" if head == "deterministic" else None)
+    loss.set_keys(action="twist")
+    inputs = policy.look(scene(8))
+    inputs["twist"] = 0.5 * torch.randn(8, 1, 6, generator=generator(7))
+    optimizer = torch.optim.Adam(policy.parameters(), lr=0.01)
+    values = []
+    for _ in range(150):
+        value = loss(inputs)["loss_bc"]
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        values.append(value.item())
+    outputs = policy.network(*(inputs[key] for key in INPUTS))
+    mean = outputs[0] if isinstance(outputs, tuple) else outputs
+    assert values[-1] < values[0] and math.isfinite(values[-1])
+    assert (mean - inputs["twist"]).abs().mean() < 0.15
+
+
+def test_a_predicted_discrepancy_is_positive_and_declared() -> None:
+    policy = learner(discrepancy=True)
+    assert ("learner", "discrepancy") in policy.out_keys
+    assert bool((act(policy, scene(3))["learner", "discrepancy"] > 0).all())
+
+
+@pytest.mark.parametrize(
+    "options", [{"encoder": "cnn"}, {"head": "x"}, {"flow": "x"}, {"points": 1}, {"chunk": 2, "execute": 3}]
+)
+def test_options_that_make_no_learner_are_refused(options: dict[str, object]) -> None:
+    with pytest.raises(UserError, match=next(reversed(options))):
+        LearnerOptions(**options)  # type: ignore[arg-type]
