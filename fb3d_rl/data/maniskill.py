@@ -46,7 +46,7 @@ def write(buffer: DemonstrationBuffer, path: Path) -> None:
         raise UserError(f"{path} exists already; choose another file")
     path.parent.mkdir(parents=True, exist_ok=True)
     about = {
-        "env_info": {"env_id": "unknown", "env_kwargs": {}, **buffer.about.get("env_info", {})},
+        "env_info": {"env_id": "unknown", "env_kwargs": {}, **(buffer.about.get("env_info") or {})},
         "source_type": "motionplanning",
         "source_desc": "recorded with fb3d_rl",
         "episodes": [_json_entry(k, info, buffer.about) for k, info in enumerate(buffer.episodes)],
