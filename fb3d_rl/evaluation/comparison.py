@@ -35,9 +35,9 @@ from fb3d_rl.evaluation.runs import Run, labels
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, SUCCESS, TRIAL, Means, Metric
 
 METHOD = (
-    ("Interval", "95 %: objects are resampled (bootstrap, 2000 times) and all trials of an object, over all seeds, "
-     "stay together. It tells how the mean would vary with other objects, for the networks as they were trained; "
-     "how it varies with training is the range over seeds."),
+    ("Interval", f"95 %: objects are resampled (bootstrap, {tables.RESAMPLES} times) and all trials of an object, over "
+     "all seeds, stay together. It tells how the mean would vary with other objects, for the networks as they were "
+     "trained; how it varies with training is the range over seeds."),
     ("Range over seeds", "the lowest and the highest seed's instance mean."),
     ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
      "a policy whose repeats differ stands in several rows."),
@@ -213,7 +213,7 @@ def _about(run: Run, settings: Mapping[str, str], folder: str) -> str:
 
 
 def _labels(names: Sequence[str], settings: Sequence[Mapping[str, str]], folders: Sequence[str]) -> list[str]:
-    """Each group's policy, where several share it with the settings in which they differ."""
+    """Each group's policy, where several share it with the settings in which they differ, "algo.lr" as "lr"."""
     out = []
     for name, own, folder in zip(names, settings, folders, strict=True):
         peers = [other for other, policy in zip(settings, names, strict=True) if policy == name]
@@ -224,8 +224,14 @@ def _labels(names: Sequence[str], settings: Sequence[Mapping[str, str]], folders
         elif len(keys) > _MAX_KEYS or alike:
             out.append(f"{name} · {folder}")
         else:
-            out.append(f"{name} · " + ", ".join(f"{key}={own.get(key, 'unset')}" for key in keys))
+            ends = Counter(map(_end, keys))
+            short = ((_end(key) if ends[_end(key)] == 1 else key, own.get(key, "unset")) for key in keys)
+            out.append(f"{name} · " + ", ".join(f"{key}={value}" for key, value in short))
     return out
+
+
+def _end(key: str) -> str:
+    return key.rpartition(".")[2]
 
 
 # --------------------------------------------------------------------------------------------------------- merging

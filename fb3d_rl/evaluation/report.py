@@ -467,6 +467,7 @@ def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
 def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
     """Instance means in the policies' colours."""
     blocks = []
+    lines = max((1 + _broken(entry.label).count("\n") for entry in found.entries), default=1)
     for metric in (SUCCESS, DISTANCE) if found.entries else ():
         plot = go.Figure()
         for entry in found.entries:
@@ -477,7 +478,7 @@ def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
             template="none",
             barmode="overlay",
             bargap=0.4,
-            height=70 + 34 * len(found.entries),
+            height=70 + max(34, 10 + 16 * lines) * len(found.entries),
             margin={"l": 8, "r": 16, "t": 12, "b": 40},
             showlegend=False,
             xaxis={
@@ -495,7 +496,7 @@ def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
 
 def _broken(label: str) -> str:
     """A long label on several lines, which leaves the bars their room on a phone."""
-    return "\n".join(textwrap.wrap(label, 24))
+    return "\n".join(textwrap.wrap(label, 27))
 
 
 def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:

@@ -157,7 +157,7 @@ def test_seeds_make_a_group_and_settings_tell_groups_apart(tmp_path: Path) -> No
             rows = trials("bc", seed, lambda *_: False)
             write_run(tmp_path / f"lr={lr},seed={seed}", "bc", seed, rows, settings={"lr": lr})
     found = compared(tmp_path)
-    assert [group.label for group in found.groups] == ["bc · algo.lr=0.001", "bc · algo.lr=0.01"]
+    assert [group.label for group in found.groups] == ["bc · lr=0.001", "bc · lr=0.01"]
     assert [[run.seed for run in group.runs] for group in found.groups] == [[0, 1], [0, 1]]
     # Two trained policies that fail alike are still two.
     assert [entry.label for entry in found.entries] == [group.label for group in found.groups]
@@ -177,6 +177,18 @@ def test_runs_without_a_configuration_are_not_taken_for_seeds(tmp_path: Path) ->
     for seed in (0, 1):
         (write_run(tmp_path / str(seed), "bc", seed, trials("bc", seed, skill)) / "config.yaml").unlink()
     assert len(compared(tmp_path).groups) == 2
+
+
+def test_labels_stay_short_and_unique(tmp_path: Path) -> None:
+    for k, settings in enumerate(({}, {"net": {"lr": 1}}, {"net": {"lr": 2}, "lr": 0.01}, {"a": 1, "b": 2, "c": 3})):
+        write_run(tmp_path / str(k), "bc", 0, trials("bc", 0, skill), settings=settings)
+    assert [group.label for group in compared(*(tmp_path / str(k) for k in range(3))).groups] == [
+        "bc · algo.lr=0.001, algo.net.lr=unset",
+        "bc · algo.lr=0.001, algo.net.lr=1",
+        "bc · algo.lr=0.01, algo.net.lr=2",
+    ]
+    # With many differences the folders tell more.
+    assert [group.label for group in compared(tmp_path).groups] == [f"bc · {k}" for k in range(4)]
 
 
 # ------------------------------------------------------------------------------------------------------- merging
@@ -339,7 +351,7 @@ def test_each_policy_meets_the_baseline_of_its_own_settings(tmp_path: Path) -> N
             rows = trials(policy, 0, lambda p, s, i, lr=lr: skill(p, s, i) and lr < 0.005)  # type: ignore[misc]
             write_run(tmp_path / f"{policy},{lr}", policy, 0, rows, settings={"lr": lr})
     pairs = {(d.entry.label, d.baseline.label) for d in compared(tmp_path).differences}
-    assert pairs == {(f"dagger · algo.lr={lr}", f"bc · algo.lr={lr}") for lr in ("0.001", "0.01")}
+    assert pairs == {(f"dagger · lr={lr}", f"bc · lr={lr}") for lr in ("0.001", "0.01")}
 
 
 # --------------------------------------------------------------------------------------------------------- labels

@@ -222,7 +222,7 @@ def test_comparison_names_every_run_and_policy(run: Path, tmp_path: Path) -> Non
         assert label in shown
     assert "0.80" in shown, "the flow's cosine"
     figure = json.dumps(compared.json_of("data-figure", "success_rate"))
-    assert "name=&lt;scrip<br>" in figure and "<scrip" not in figure
+    assert "&lt;script&gt;a<br>" in figure and "<script" not in figure
     with pytest.raises(UserError, match="twice"):
         compare([read_run(run), read_run(run)])
 
