@@ -13,7 +13,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from fb3d_rl.algos.artflownet import run, run_evaluation
-from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.training.run_log import RunLog, read_rows
 
@@ -39,6 +39,8 @@ SMALL = [
 def config(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
     store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
     store.store(name=f"{name}_schema", node=schema)
+    store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
+    store.store(group="algo", name="imitation_schema", node=ImitationConfig)
     with initialize_config_dir(CONF, version_base="1.3"):
         cfg = OmegaConf.to_object(compose(name, overrides))
     validate(cfg)

@@ -287,7 +287,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     job.train()
     policies: dict[str, Any] = {"expert": job.expert} if cfg.evaluation.expert else {}
     policies[policy_name(job.algo)] = acting_policy(job.expert, job.learner, job.algo.oracle)
-    facts = setup.facts(cfg) | {"labels": job.labels, "expert_share": job.expert_share}
+    facts = setup.facts(cfg) | {"policy": policy_name(job.algo), "labels": job.labels, "expert_share": job.expert_share}
     return evaluate(out, job.tested, policies, job.protocol, facts)
 
 
