@@ -339,6 +339,7 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
         _one_of("algo.name", cfg.algo.name, ("artflownet", "bc", "dagger"))
+        _one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         if isinstance(cfg.algo, ArtFlowNetConfig):
             _validate_artflownet(cfg.algo)
         elif isinstance(cfg.algo, ImitationConfig):

@@ -34,6 +34,8 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "assets/partnet_mobility"): ["assets.root=."],
     ("evaluate", "assets/partnet_mobility"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/dagger"): ["checkpoint=checkpoint.pt"],
 }
 TRAINING_ONLY = {"experiment/partnet"}
 
