@@ -17,14 +17,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Workers
-from fb3d_rl.evaluation.rollout import policy_env, run_trials
+from fb3d_rl.evaluation.rollout import create_env, policy_env, run_trials, state_of
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import Scheduled
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
@@ -192,7 +191,9 @@ def labelling(
     with one_core(), ExitStack() as stack:
         workers = {
             name: stack.enter_context(
-                Workers(partial(_collected_env, objects, options, policy), policy, CollectorOptions(), options.horizon)
+                Workers(
+                    partial(create_env, objects, options, state_of(policy)), policy, CollectorOptions(), options.horizon
+                )
             )
             for name, policy in policies.items()
         }
@@ -213,10 +214,6 @@ def labelling(
         "labelled by the expert, rows/s": steps / min(labelled),
         "labelled / alone": median(_ratios(alone, labelled)),
     }
-
-
-def _collected_env(objects: Sequence[ArticulatedObject], options: EnvOptions, policy: TensorDictModuleBase) -> EnvBase:
-    return policy_env(make_env(objects, options), policy)
 
 
 def worker_scaling(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fb3d_rl.flow.rigid_motion import rigid_motion, screw
@@ -166,9 +168,12 @@ def _blocked(
 
     ``squared`` [B, M, N] are the squared distances from the M points to the N of the cloud.
     """
-    ahead = standoff @ cloud.mT - (standoff * points).sum(-1, keepdim=True)  # [B, M, N]
-    aside = torch.addcmul(squared, ahead, ahead, value=-1)
-    inside = (ahead > options.clearance) & (ahead < options.reach) & (aside < options.hand_radius**2) & valid[:, None]
+    middle, half = (options.reach + options.clearance) / 2, (options.reach - options.clearance) / 2
+    # In place and with one comparison: memory for M times N numbers takes longer to come by than to fill.
+    ahead = (standoff @ cloud.mT).sub_((standoff * points).sum(-1, keepdim=True))  # [B, M, N]
+    outside = torch.addcmul(squared, ahead, ahead, value=-1).sub_(options.hand_radius**2)
+    beyond = ahead.sub_(middle).abs_().sub_(half)
+    inside = (torch.maximum(outside, beyond, out=outside) < 0).logical_and_(valid[:, None])
     return (inside.sum(-1, dtype=torch.int32) > 1) | _underground(points, standoff, options)
 
 
@@ -210,9 +215,18 @@ def _clear(
     at = (turn @ arm).squeeze(-1) + shift + centre[:, None, None]
     reach = torch.linspace(options.clearance, options.hand_length, 3, device=points.device)
     hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
-    # What is no obstacle is put far off.
-    gap = torch.cdist(hand.flatten(1, 3), torch.where(obstacle[..., None], cloud, 1e3)).amin(-1)
-    gap = gap.view(hand.shape[:-1])
-    clear = ((gap > options.hand_radius) & (hand[..., 2] > 0)).flatten(2).all(-1)
+    meets = torch.stack(
+        [
+            _within(balls, stuff[mask], options.hand_radius)
+            for balls, stuff, mask in zip(hand, cloud, obstacle, strict=True)
+        ]
+    )
+    clear = (~meets & (hand[..., 2] > 0)).flatten(2).all(-1)
     result = torch.zeros_like(wanted).scatter(1, index, clear)
     return result & wanted
+
+
+def _within(points: Tensor, others: Tensor, radius: float) -> Tensor:
+    """Whether any of others [N, 3] is nearer than ``radius`` to each point [..., 3]; by a search tree, on the CPU."""
+    distance, _ = cKDTree(others.cpu()).query(points.flatten(0, -2).cpu(), distance_upper_bound=radius)
+    return torch.from_numpy(np.isfinite(distance)).to(points.device).view(points.shape[:-1])

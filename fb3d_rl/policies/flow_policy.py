@@ -359,8 +359,9 @@ class FlowPolicy(TensorDictModuleBase):
         state = {}
         for key, (shape, dtype) in self.STATE.items():
             values = np.array([getattr(memory, key) for memory in memories])
-            state[key] = torch.from_numpy(values).reshape(*batch, *shape).to(device, dtype)
-        return TensorDict(state, batch_size=batch, device=device)
+            state[key] = torch.from_numpy(values).to(device, dtype).view(*batch, *shape)
+        # As in TorchRL's own libraries, without the checks of each entry at each step.
+        return TensorDict._new_unsafe(source=state, batch_size=torch.Size(batch), device=device)
 
 
 def _numbers(values: Tensor) -> np.ndarray:

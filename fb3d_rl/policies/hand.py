@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from fb3d_rl.contract import ACTION_DIM
-from fb3d_rl.geometry.transforms import euler_xyz_jacobian, quaternion_to_matrix
+from fb3d_rl.geometry.transforms import euler_xyz_jacobian, normalize
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class VelocityLimits:
 
 def hand_axis(tool_pose: Tensor) -> Tensor:
     """v_1 of I.F [..., 3]: from the suction tip to the hand, which is the tool frame's -x axis."""
-    return -quaternion_to_matrix(tool_pose[..., 3:])[..., 0]
+    w, x, y, z = normalize(tool_pose[..., 3:]).unbind(-1)
+    # The first column of the rotation matrix, turned round.
+    return torch.stack([2 * (y * y + z * z) - 1, -2 * (x * y + w * z), 2 * (w * y - x * z)], dim=-1)
 
 
 def across(hand: Tensor, vectors: Tensor) -> Tensor:
