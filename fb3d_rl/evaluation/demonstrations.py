@@ -26,7 +26,7 @@ from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Tria
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers, steady_floats
 from fb3d_rl.evaluation.film import Film, record
-from fb3d_rl.evaluation.rollout import policy_env
+from fb3d_rl.evaluation.rollout import policy_env, state_of
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
@@ -251,4 +251,4 @@ def replay(buffer: DemonstrationBuffer, episode: int, obj: ArticulatedObject) ->
 def _create_env(
     objects: Sequence[ArticulatedObject], options: EnvOptions, policy: TensorDictModuleBase | None = None
 ) -> EnvBase:
-    return policy_env(make_env(objects, options), policy)
+    return policy_env(make_env(objects, options), state_of(policy))
