@@ -14,8 +14,9 @@ from tensordict import TensorDictBase
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import ObjectView, SampleOptions
-from fb3d_rl.env.options import Trial
 from fb3d_rl.env.workers import Workers
+from fb3d_rl.evaluation import demonstrations
+from fb3d_rl.evaluation.demonstrations import episode_info
 from fb3d_rl.evaluation.trials import draw_trials
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
@@ -23,7 +24,8 @@ from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
 STEPS_OF_TRIAL = 60
 """Labels that a trial is reckoned to bring."""
 
-OUTCOME: tuple[Key, ...] = (("next", "success"), ("next", "contact"), ("next", "normalized_distance"))
+OUTCOME: tuple[Key, ...] = (*demonstrations.OUTCOME, ("next", "contact"))
+"""What a round's numbers are made of."""
 
 EXPERT: tuple[Key, ...] = ("action", ("expert", "action"), ("expert", "acts"), "elapsed_steps")
 """What a row holds besides what the learner reads and writes."""
@@ -88,7 +90,7 @@ def collect(
             if index not in ended:
                 continue
             frames = rows.of(ended[index])
-            info = _info(trial, categories[trial.object], number, ended[index])
+            info = episode_info(trial, categories[trial.object], ended[index], number)
             outcomes.append((info.success, bool(ended[index]["next", "contact"].any()),
                              float(ended[index]["expert", "acts"].float().mean())))  # fmt: skip
             if count < labels and len(frames):
@@ -151,14 +153,6 @@ def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer
         raise UserError(f"the demonstrations at {source.path} lack {', '.join(map(str, lacking))}; record them anew")
     for episode, info in enumerate(source.episodes):
         target.extend(rows.of(source.frames(episode)), info)
-
-
-def _info(trial: Trial, category: str, number: int, frames: TensorDictBase) -> EpisodeInfo:
-    last = frames["next"][-1]
-    return EpisodeInfo(
-        trial.object, category, trial.link, trial.start, trial.view, trial.seed, number,
-        bool(last["success"]), float(last["normalized_distance"]), len(frames),
-    )  # fmt: skip
 
 
 def relabelled(rows: TensorDictBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
@@ -30,14 +29,14 @@ from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.workers import Workers
-from fb3d_rl.evaluation.evaluate import evaluate
+from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.rollout import create_env, run_trials, state_of
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
-from fb3d_rl.policies.gates import make_gate
+from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
@@ -154,14 +153,14 @@ class Run:
 
     def save(self) -> None:
         """Write the checkpoint."""
-        done, weights = self.done, networks(self.learner).state_dict()
+        done, weights, flow_net = self.done, networks(self.learner).state_dict(), flow_network(self.learner)
         if done.fit is None:
             done.learner = {key: value.clone() for key, value in weights.items()}
         done.gate = self.policy.gate.state_dict()
         state = {
             "run": {item.name: getattr(done, item.name) for item in fields(done)},
             "model": weights,
-            "flow_model": flow_weights(self.learner),
+            "flow_model": None if flow_net is None else flow_net.state_dict(),
             "step": done.round,
         }
         kwargs = {
@@ -170,7 +169,7 @@ class Run:
             "limits": asdict(self.limits),
             "oracle": self.algo.oracle,
             "name": policy_name(self.algo),
-            "flow_net": flow_arguments(self.learner),
+            "flow_net": None if flow_net is None else flow_net.arguments,
         }
         save_checkpoint(self.out / CHECKPOINT, algo=self.algo.name, config=asdict(self.cfg), model_kwargs=kwargs,
                         state=state, seed=self.cfg.seed)  # fmt: skip
@@ -182,7 +181,7 @@ class Run:
         options, horizon = setup.collector_options(self.cfg), self.protocol.env.horizon
         with ExitStack() as stack:
             log = stack.enter_context(RunLog(self.out, resume_rows=done.log_rows if self.cfg.resume else None))
-            bar = stack.enter_context(_progress())
+            bar = stack.enter_context(progress_bars())
             workers = stack.enter_context(Workers(create, self.policy, options, horizon))
             beside = stack.enter_context(ThreadPoolExecutor(1)) if algo.overlap else None
             pending: Future[Round] | None = None
@@ -347,16 +346,9 @@ def networks(learner: Learner | Ensemble) -> nn.ModuleList:
     return nn.ModuleList(member.network for member in members(learner))
 
 
-def flow_arguments(learner: Learner | Ensemble) -> dict[str, Any] | None:
-    """What builds the learner's flow network, if it has one."""
-    net = members(learner)[0].flow_network
-    return None if net is None else net.arguments
-
-
-def flow_weights(learner: Learner | Ensemble) -> dict[str, Tensor] | None:
-    """Weights of the learner's flow network, if it has one."""
-    net = members(learner)[0].flow_network
-    return None if net is None else net.state_dict()
+def flow_network(learner: Learner | Ensemble) -> ArtFlowNet | None:
+    """The network that predicts the flow for the learner, if it has one."""
+    return members(learner)[0].flow_network
 
 
 def acting_policy(expert: FlowPolicy, learner: Learner | Ensemble, oracle: bool) -> TensorDictModuleBase:
@@ -392,8 +384,7 @@ def round_beta(algo: ImitationConfig, number: int) -> float:
 
 def learner_options(algo: ImitationConfig) -> LearnerOptions:
     """The learner's network; it predicts its distance from the expert if the gate asks for that."""
-    asked = any(("learner", "discrepancy") in gate.in_keys for gate in [new_gate(algo)])
-    return LearnerOptions(**asdict(algo.learner), discrepancy=asked)
+    return LearnerOptions(**asdict(algo.learner), discrepancy=PREDICTED in new_gate(algo).in_keys)
 
 
 def rows_options(algo: ImitationConfig, limits: VelocityLimits, gate: Gate) -> RowsOptions:
@@ -450,7 +441,3 @@ def imitation_objective(learner: Learner | Ensemble, algo: ImitationConfig, seed
         return torch.stack(values).mean()
 
     return objective
-
-
-def _progress() -> Progress:
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

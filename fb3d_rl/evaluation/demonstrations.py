@@ -13,7 +13,6 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import partnet_catalog, procedural_catalog
@@ -23,10 +22,9 @@ from fb3d_rl.contract import Key, UserError, spec
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
-from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers, steady_floats
 from fb3d_rl.evaluation.film import Film, record
-from fb3d_rl.evaluation.rollout import policy_env, state_of
+from fb3d_rl.evaluation.rollout import create_env, state_of
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
@@ -95,11 +93,11 @@ def plan(
     return found
 
 
-def episode_info(item: Scheduled, frames: TensorDictBase, round: int = 0) -> EpisodeInfo:
+def episode_info(trial: Trial, category: str, frames: TensorDictBase, round: int = 0) -> EpisodeInfo:
     """What the buffer's table says about an episode of frames [T], which hold :data:`OUTCOME`."""
-    trial, after = item.trial, frames["next"][-1]
+    after = frames["next"][-1]
     return EpisodeInfo(
-        trial.object, item.category, trial.link, trial.start, trial.view, trial.seed, round,
+        trial.object, category, trial.link, trial.start, trial.view, trial.seed, round,
         bool(after["success"]), float(after["normalized_distance"]), len(frames),
     )  # fmt: skip
 
@@ -139,7 +137,7 @@ def record_expert(
     """
     expert = expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
     policy = InteractivePolicy(expert, None, BetaGate())
-    create = partial(_create_env, tuple(objects), options, policy)
+    create = partial(create_env, tuple(objects), options, state_of(policy))
     waiting: dict[int, Episode] = {}
     following = 0
     try:
@@ -150,7 +148,7 @@ def record_expert(
                     done, item = waiting.pop(following), scheduled[following]
                     kept = done.frames is not None and (not successful or bool(done.frames["next", "success"][-1]))
                     if kept and done.frames is not None:
-                        buffer.extend(done.frames.select(*KEYS), episode_info(item, done.frames))
+                        buffer.extend(done.frames.select(*KEYS), episode_info(item.trial, item.category, done.frames))
                     following += 1
                     if following % COMMIT_EVERY == 0:
                         buffer.commit()
@@ -246,9 +244,3 @@ def replay(buffer: DemonstrationBuffer, episode: int, obj: ArticulatedObject) ->
     seen = torch.from_numpy(film.points[:-1]), torch.from_numpy(film.tips[:-1])
     kept = frames["observation", "points"], frames["observation", "tool_pose"][:, :3]
     return film, all(torch.equal(a, b) for a, b in zip(seen, kept, strict=True))
-
-
-def _create_env(
-    objects: Sequence[ArticulatedObject], options: EnvOptions, policy: TensorDictModuleBase | None = None
-) -> EnvBase:
-    return policy_env(make_env(objects, options), state_of(policy))

@@ -92,7 +92,7 @@ def evaluate(
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
     rows: list[TrialRow] = []
-    with _progress() as bar:
+    with progress_bars() as bar:
         for name, policy in policies.items() if scheduled else ():
             task = bar.add_task(f"trials: {name}", total=len(scheduled))
             advance = partial(_advance, bar, task)
@@ -104,7 +104,7 @@ def evaluate(
     if net is not None:
         write_picture(out)
     if rows and protocol.videos:
-        with _progress() as bar:
+        with progress_bars() as bar:
             task = bar.add_task("videos", total=None)
             film_trials(
                 out / "videos", rows, protocol.videos, policies, shown, scheduled, protocol.env,
@@ -117,7 +117,8 @@ def evaluate(
     return rows
 
 
-def _progress() -> Progress:
+def progress_bars() -> Progress:
+    """Bars of long work: what, how much of it is done, and how long the rest will take."""
     return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 

@@ -22,7 +22,6 @@ from fb3d_rl.evaluation.demonstrations import (
     KEYS,
     Assets,
     Replay,
-    _create_env,
     plan,
     recipe,
     record_expert,
@@ -31,6 +30,7 @@ from fb3d_rl.evaluation.demonstrations import (
     replay,
     trial_of,
 )
+from fb3d_rl.evaluation.rollout import create_env, state_of
 from fb3d_rl.evaluation.trials import Scheduled
 
 OPTIONS = EnvOptions(points=64, horizon=60)
@@ -95,7 +95,9 @@ def test_recorded_actions_lead_to_the_recorded_states_bit_for_bit(
     assert options == OPTIONS
     for episode, info in enumerate(buffer.episodes):
         frames = buffer.frames(episode)
-        create = partial(_create_env, [recorded_object(buffer, episode)], replace(options, horizon=info.rows))
+        create = partial(
+            create_env, [recorded_object(buffer, episode)], replace(options, horizon=info.rows), state_of()
+        )
         with Workers(create, Replay(frames["action"]), CollectorOptions(), info.rows) as workers:
             (again,) = workers.run([trial_of(info)])
         assert again.frames is not None, again.error
