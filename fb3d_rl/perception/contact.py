@@ -44,7 +44,7 @@ class ContactOptions:
     rim: float = 0.45
     min_distance: float = 0.02
     min_flow: float = 0.5
-    near: float = 0.2
+    near: float = 1.0
     facing: float = 0.35
     hand_radius: float = 0.05
     clearance: float = 0.06

@@ -53,7 +53,9 @@ class FlowPolicyOptions:
         hand_length: from the tip to the hand's far end, m.
         clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
             between itself and the ground z = 0.
-        margin: distance (m) that the tip keeps from the object's bounding sphere while it travels.
+        funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
+        free: distance (m) from the visible points at which a straight way to the approach line is free.
+        margin: distance (m) that the tip keeps from the object's bounding sphere where the straight way is not free.
     """
 
     travel_speed: float = 1.8
@@ -72,6 +74,8 @@ class FlowPolicyOptions:
     lead: float = 0.025
     hand_length: float = 0.2
     clearance: float = 0.08
+    funnel: float = 0.5
+    free: float = 0.08
     margin: float = 0.1
     contact: ContactOptions = field(default_factory=ContactOptions)
 
@@ -169,7 +173,7 @@ class FlowPolicy(TensorDictModuleBase):
             self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force)
         self._choose(memories, obs, flow)
         pulls = self._flow_at(memories, obs, flow)
-        spheres = self._bounding_spheres(memories, obs)
+        clouds = self._clouds(memories, obs)
 
         twists = np.empty((len(memories), 6))
         for i, (memory, tip, hand) in enumerate(zip(memories, tips, hands, strict=True)):
@@ -180,7 +184,7 @@ class FlowPolicy(TensorDictModuleBase):
                 memory.pull = pulls[i]
                 velocity = self.options.pull_speed * memory.pull
             elif memory.phase == TRAVEL:
-                velocity = self._travel(memory, tip, *spheres[i])
+                velocity = self._travel(memory, tip, clouds[i])
             else:
                 velocity = self._path_velocity(memory, tip)
             wanted = self._above_ground(memory.standoff, tip)
@@ -279,33 +283,39 @@ class FlowPolicy(TensorDictModuleBase):
             return self.limits.linear * memory.leave
         return np.zeros(3)
 
-    def _bounding_spheres(self, memories: list[Memory], obs: TensorDictBase) -> dict[int, tuple[Vector, float]]:
-        """Centre and radius (m), with a margin, of a sphere around the cloud of each environment on its way."""
+    def _clouds(self, memories: list[Memory], obs: TensorDictBase) -> dict[int, np.ndarray]:
+        """The visible points [M, 3] of each environment on its way, m."""
         rows = _in_phase(memories, TRAVEL)
-        if not rows:
-            return {}
-        points, valid = _rows(obs["points"], rows), _rows(obs["valid"], rows)[..., None]
-        low = torch.where(valid, points, torch.inf).amin(1)
-        high = torch.where(valid, points, -torch.inf).amax(1)
-        centre = torch.nan_to_num(0.5 * (low + high), posinf=0.0, neginf=0.0)
-        radius = torch.where(valid, points - centre[:, None], 0.0).norm(dim=-1).amax(-1) + self.options.margin
-        return dict(zip(rows, zip(_numbers(centre), radius.tolist(), strict=True), strict=True))
+        return {i: _numbers(obs["points"][i][obs["valid"][i]]) for i in rows}
 
-    def _travel(self, memory: Memory, tip: Vector, centre: Vector, radius: float) -> Vector:
-        """Velocity around the object's bounding sphere to where the approach line leaves it.
+    def _travel(self, memory: Memory, tip: Vector, cloud: np.ndarray) -> Vector:
+        """Velocity to the approach line: straight into a funnel that narrows to the pre-contact point, if that is free.
 
-        A hand that comes from another side of the object leaves the sphere first as it backed off before.
+        Otherwise around the object's bounding sphere to where the approach line leaves it. A hand that comes from
+        another side of the object leaves the sphere first as it backed off before.
         """
         o, contact, standoff = self.options, memory.contact_point, memory.standoff
+        highest = math.inf  # of a goal on the approach line that stays above the ground
+        if standoff[2] < 0:
+            highest = max((contact[2] - o.clearance) / -standoff[2], 2 * o.precontact)
+        if not memory.leave.any():
+            offset = tip - contact
+            sideways = length(offset - (offset @ standoff) * standoff)
+            goal = contact + min(o.precontact + o.funnel * sideways, highest) * standoff
+            if not self._in_the_way(cloud, tip, goal):
+                straight = goal - tip
+                return min(6.0 * length(straight), o.travel_speed) * normalize(straight)
+
+        centre, radius = np.zeros(3), o.margin
+        if len(cloud):
+            centre = 0.5 * (cloud.min(0) + cloud.max(0))
+            radius += float(np.linalg.norm(cloud - centre, axis=-1).max())
         # |contact + t standoff - centre| = radius, the larger root
         from_centre = contact - centre
         b = float(from_centre @ standoff)
         c = float(from_centre @ from_centre) - radius**2
         t = -b + math.sqrt(max(b * b - c, 0.0))
-        descent = -standoff[2]
-        if descent > 0:
-            t = min(t, (contact[2] - o.clearance) / max(descent, 1e-6))
-        goal = contact + max(t, 2 * o.precontact) * standoff
+        goal = contact + min(max(t, 2 * o.precontact), highest) * standoff
 
         distance = length(tip - centre)
         if distance > radius or memory.leave @ standoff >= 0.5:
@@ -320,6 +330,14 @@ class FlowPolicy(TensorDictModuleBase):
             return o.travel_speed * normalize(around)
         straight = goal - tip
         return min(6.0 * length(straight), o.travel_speed) * normalize(straight)
+
+    def _in_the_way(self, cloud: np.ndarray, tip: Vector, goal: Vector) -> bool:
+        """Whether the straight way brings the tip near to points of the cloud that it is not as near to already."""
+        way, offset = goal - tip, cloud - tip
+        share = np.clip(offset @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        nearest = np.linalg.norm(offset - share[:, None] * way, axis=-1)
+        near = (nearest < self.options.free) & (nearest < np.linalg.norm(offset, axis=-1) - 0.01)
+        return int(near.sum()) > 1
 
     def _flow_at(self, memories: list[Memory], obs: TensorDictBase, flow: Tensor) -> dict[int, Vector]:
         """Unit flow at the held point of each environment that pulls, ``lead`` ahead; the last one where none is seen.

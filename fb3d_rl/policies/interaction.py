@@ -16,7 +16,7 @@ from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRA
 CHOOSE_AGAIN = 8
 """Steps after which an expert that looks on chooses the contact point again while the hand is on its way."""
 
-ASTRAY = 0.1
+ASTRAY = 0.06
 """Distance (m) from the approach line at which it gives up the line."""
 
 
@@ -220,4 +220,6 @@ class InteractivePolicy(TensorDictModuleBase):
         sideways = offset - (offset * standoff).sum(-1, keepdim=True) * standoff
         astray = (state["phase"] == APPROACH) & (sideways.norm(dim=-1, keepdim=True) > ASTRAY)
         due = (state["phase"] == TRAVEL) & (tensordict["elapsed_steps"] % CHOOSE_AGAIN == 0)
-        state["phase"] = torch.where(looks_on & (away | astray | due), SELECT, state["phase"])
+        anew = looks_on & (away | astray | due)
+        state["phase"] = torch.where(anew, SELECT, state["phase"])
+        state["leave"] = torch.where(anew, 0.0, state["leave"])

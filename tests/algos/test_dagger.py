@@ -1,0 +1,210 @@
+"""The loop of algo=bc and algo=dagger in small: rounds, labels, who acts, the same bits, and a run that is killed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
+from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.evaluation.rows import read_trials
+from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.learner import twist_of
+from fb3d_rl.training.checkpoint import load_checkpoint
+from fb3d_rl.training.run_log import read_rows
+
+ROOT = Path(__file__).parents[2]
+SMALL = [
+    "experiment=smoke",
+    "algo=dagger",
+    "algo.rounds=2",
+    "algo.labels=90",
+    "algo.steps=8",
+    "algo.batch_size=8",
+    "algo.learner.encoder=pointnet",
+    "algo.learner.width=8",
+    "algo.learner.points=64",
+    "algo.log_every=2",
+    "algo.checkpoint_every=3",
+    "algo.validate_trials=1",
+    "assets.categories=[Microwave]",
+    "data.points=256",
+    "camera.resolution=48",
+    "evaluation.trials=1",
+    "env.horizon=70",
+]
+
+
+def config(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
+    store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
+    store.store(name=f"{name}_schema", node=schema)
+    store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
+    store.store(group="algo", name="imitation_schema", node=ImitationConfig)
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        cfg = OmegaConf.to_object(compose(name, overrides))
+    validate(cfg)
+    return cfg
+
+
+def train(out: Path, *overrides: str) -> Path:
+    run(config("train", [*SMALL, *overrides]), out)
+    return out
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """The same log, weights, labels and trials."""
+    assert read_rows(one / "metrics.jsonl", times=False) == read_rows(other / "metrics.jsonl", times=False)
+    weights, others = (load_checkpoint(out / CHECKPOINT)["state"]["model"] for out in (one, other))
+    assert weights.keys() == others.keys() and all(torch.equal(weights[key], others[key]) for key in weights)
+    rows, others = (DemonstrationBuffer.open(out / BUFFER) for out in (one, other))
+    assert rows.episodes == others.episodes and len(rows) == len(others)
+    assert (rows[torch.arange(len(rows))] == others[torch.arange(len(rows))]).all()
+    assert (one / "rows.csv").read_bytes() == (other / "rows.csv").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train(tmp_path_factory.mktemp("first"))
+
+
+def test_rounds_labels_and_who_acts(first: Path) -> None:
+    buffer = DemonstrationBuffer.open(first / BUFFER)
+    by_round: dict[int, list[torch.Tensor]] = {0: [], 1: []}
+    for i, info in enumerate(buffer.episodes):
+        by_round[info.round].append(buffer.frames(i)["expert", "acts"].flatten())
+    acts = [torch.cat(by_round[number]) for number in (0, 1)]
+    assert [len(each) for each in acts] == [45, 45], "exactly the labels that were asked for"
+    assert acts[0].all() and not acts[1].any(), "beta is 1, then 0"
+    log = [row for row in read_rows(first / "metrics.jsonl") if "labels" in row]
+    assert [(row["round"], row["labels"], row["beta"], row["step"]) for row in log] == [
+        (0, 45, 1.0, 4),
+        (1, 90, 0.0, 8),
+    ]
+    assert all("val/success_rate" in row for row in log)
+    summary = json.loads((first / "summary.json").read_text())
+    assert summary["labels"] == 90 and summary["expert_share"] == 0.5
+    assert [row.policy for row in read_trials(first / "rows.csv")] == ["expert", "dagger"]
+
+
+def test_a_row_holds_the_experts_label_whoever_acted(first: Path) -> None:
+    buffer = DemonstrationBuffer.open(first / BUFFER)
+    rows = buffer[torch.arange(len(buffer))]
+    acts = rows["expert", "acts"].flatten()
+    differs = (rows["action"] != rows["expert", "action"]).any(-1)
+    assert not differs[acts].any() and differs[~acts].all()
+    limits = VelocityLimits(**load_checkpoint(first / CHECKPOINT)["model_kwargs"]["limits"])
+    expected = twist_of(rows["observation"], rows["expert", "action"], limits)
+    assert torch.allclose(rows["expert", "twist"], expected, atol=1e-6)
+    assert not any(key[0] == "privileged" for key in rows.keys(True, True) if isinstance(key, tuple))
+
+
+def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Path) -> None:
+    train(tmp_path, "algo=bc", "algo.rounds=1", "algo.labels=45", "algo.steps=4", "evaluation.expert=false")
+    cloned, dagger = DemonstrationBuffer.open(tmp_path / BUFFER), DemonstrationBuffer.open(first / BUFFER)
+    index = torch.arange(45)
+    assert len(cloned) == 45 and cloned[index]["expert", "acts"].all()
+    # One code path: DAgger's first round is the same data, and the same fit of it.
+    assert (cloned[index] == dagger[index]).all()
+    fits = [[row["loss"] for row in read_rows(out / "metrics.jsonl") if "loss" in row and row["round"] == 0]
+            for out in (tmp_path, first)]  # fmt: skip
+    assert fits[0] == fits[1]
+    assert [row.policy for row in read_trials(tmp_path / "rows.csv")] == ["bc"]
+
+
+def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path) -> None:
+    keep = ("assets.", "data.", "camera.", "evaluation.", "env.", "experiment=")
+    same = [item for item in SMALL if item.startswith(keep)]
+    run_evaluation(config("evaluate", [*same, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]), tmp_path)
+    assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+
+
+@pytest.mark.slow
+def test_any_number_of_workers_gives_the_same_run(first: Path, tmp_path: Path) -> None:
+    assert_same_run(train(tmp_path, "collector=process", "collector.workers=2"), first)
+
+
+@pytest.mark.slow
+def test_collection_beside_the_fit_repeats(tmp_path: Path) -> None:
+    beside = ["collector=process", "collector.workers=2", "algo.overlap=true", "algo.rounds=3"]
+    assert_same_run(train(tmp_path / "one", *beside), train(tmp_path / "other", *beside))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["algo=bc_oracle_flow", "algo.rounds=1"],
+        ["algo=dagger_oracle"],
+        ["algo=dagger_flow", "algo.learner.head=gaussian", "algo.learner.chunk=3", "algo.learner.execute=2"],
+        ["algo=dagger", "algo.beta.schedule=exponential", "algo.beta.mixing=episode"],
+        ["algo=safe_dagger"],
+        ["algo=ensemble_dagger"],
+        ["algo=lazy_dagger"],
+        ["algo=thrifty_dagger"],
+    ],
+    ids=lambda overrides: " ".join(overrides),
+)
+def test_every_variant_runs(tmp_path: Path, overrides: list[str]) -> None:
+    algo, *further = overrides
+    train(tmp_path, algo, *further)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["labels"] == 90 and 0 < summary["expert_share"] <= 1
+    assert {row.policy for row in read_trials(tmp_path / "rows.csv")} == {"expert", summary["policy"]}
+    if "oracle" in algo:  # the learner is trained on held parts, where it acts
+        rows = DemonstrationBuffer.open(tmp_path / BUFFER)
+        assert rows[torch.arange(len(rows))]["observation", "attached"].all()
+
+
+KILLED = {
+    "collecting": "fb3d_rl.algos.dagger.collect",
+    "writing rows": "fb3d_rl.data.demonstrations.DemonstrationBuffer.extend",
+    "closing a round": "fb3d_rl.data.demonstrations.DemonstrationBuffer.commit",
+    "writing a checkpoint": "fb3d_rl.training.checkpoint.torch.save",
+    "fitting": "fb3d_rl.training.fit.generator",
+    "writing the log": "fb3d_rl.training.run_log.RunLog.write",
+    "validating": "fb3d_rl.algos.dagger.run_trials",
+    "evaluating": "fb3d_rl.algos.dagger.evaluate",
+}
+"""What is called in each phase of a run."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("phase", KILLED)
+def test_a_run_killed_in_any_phase_goes_on_as_if_nothing_had_happened(first: Path, tmp_path: Path, phase: str) -> None:
+    # In the last call to what belongs to the phase, or as near to it as can be told beforehand.
+    program = f"""
+import os, pkgutil, runpy, signal, sys
+from unittest import mock
+target, (where, name) = {KILLED[phase]!r}, {KILLED[phase]!r}.rsplit(".", 1)
+owner = pkgutil.resolve_name(where)
+calls, original = 0, getattr(owner, name)
+def dies(*args, **kwargs):
+    global calls
+    calls += 1
+    result = original(*args, **kwargs)  # the work is done, and nothing after it
+    if calls == {{"fb3d_rl.training.fit.generator": 14, "fb3d_rl.algos.dagger.evaluate": 1}}.get(target, 2):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return result
+setattr(owner, name, dies)
+sys.path.insert(0, {str(ROOT / "launch")!r})
+sys.argv = ["train.py", *{SMALL!r}, "hydra.run.dir={tmp_path / "run"}"]
+runpy.run_path({str(ROOT / "launch" / "train.py")!r}, run_name="__main__")
+"""
+    killed = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=300, check=False)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    run(config("train", [*SMALL, "resume=true"]), tmp_path / "run")
+    assert_same_run(tmp_path / "run", first)
+
+
+def test_shares_add_up() -> None:
+    assert [share(10, 4, i) for i in range(4)] == [3, 3, 2, 2]
