@@ -6,6 +6,7 @@ Behaviour cloning is the case of one round in which the expert always acts.
 from __future__ import annotations
 
 import math
+import shutil
 import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -122,7 +123,10 @@ class Run:
         self.device, self.protocol = setup.choose_device(cfg.device), setup.protocol(cfg)
         setup.require_simulator()
         self.limits = setup.velocity_limits(cfg)
-        saved = load_checkpoint(out / CHECKPOINT, algo=algo.name) if cfg.resume else None
+        # A run that was killed before its first checkpoint has lost nothing: it starts anew.
+        begun = (out / "config.yaml").is_file() and not (out / CHECKPOINT).exists()
+        saved = load_checkpoint(out / CHECKPOINT, algo=algo.name) if cfg.resume and not begun else None
+        self.resumed = saved is not None
         given = DemonstrationBuffer.open(algo.demonstrations) if algo.demonstrations else None
 
         self.expert = expert_policy(self.limits, setup.flow_policy_options(cfg))
@@ -138,6 +142,8 @@ class Run:
 
         if saved is None:
             self.done = Progression()
+            if cfg.resume:
+                shutil.rmtree(out / BUFFER, ignore_errors=True)
             self.buffer = DemonstrationBuffer.create(out / BUFFER, algo.labels + (len(given) if given else 0))
             if given is not None:
                 copy_demonstrations(given, self.buffer, self.rows)
@@ -180,7 +186,7 @@ class Run:
         create = partial(create_env, tuple(self.objects), self.protocol.env, state_of(self.policy))
         options, horizon = setup.collector_options(self.cfg), self.protocol.env.horizon
         with ExitStack() as stack:
-            log = stack.enter_context(RunLog(self.out, resume_rows=done.log_rows if self.cfg.resume else None))
+            log = stack.enter_context(RunLog(self.out, resume_rows=done.log_rows if self.resumed else None))
             bar = stack.enter_context(progress_bars())
             workers = stack.enter_context(Workers(create, self.policy, options, horizon))
             beside = stack.enter_context(ThreadPoolExecutor(1)) if algo.overlap else None
