@@ -35,7 +35,8 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	touch $@
 
 # torch pulls in its CUDA packages itself where its build needs them, so the lock leaves them out: it serves every machine.
-lock:
+lock: $(VENV)/installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	echo "torch==2.13.0" | $(BIN)/uv pip compile --universal --python-version 3.10 --extra dev --no-annotate --no-header \
 	  --constraint - pyproject.toml --quiet | grep -vE "^(nvidia-(c|n[vc])|cuda-|triton)" > requirements.lock.part
 	mv requirements.lock.part requirements.lock

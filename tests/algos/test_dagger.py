@@ -145,7 +145,8 @@ def test_collection_beside_the_fit_repeats(tmp_path: Path) -> None:
     [
         ["algo=bc_oracle_flow", "algo.rounds=1"],
         ["algo=dagger_oracle"],
-        ["algo=dagger_flow", "algo.learner.head=gaussian", "algo.learner.chunk=3", "algo.learner.execute=2"],
+        ["algo=dagger_flow", "algo.learner.chunk=3", "algo.learner.execute=2"],
+        ["algo=bc", "algo.learner.head=gaussian"],
         ["algo=dagger", "algo.beta.schedule=exponential", "algo.beta.mixing=episode"],
         ["algo=safe_dagger"],
         ["algo=ensemble_dagger"],
