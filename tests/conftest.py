@@ -1,15 +1,21 @@
-"""Objects that the tests share: a few procedural ones, made once, and a root of real ones where there is one."""
+"""What the tests share: a few procedural objects, a root of real ones where there is one, and configurations."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 
 
 @pytest.fixture(scope="session")
@@ -34,3 +40,20 @@ def real_root() -> Path:
     if not root:
         pytest.skip("FB3D_PARTNET_MOBILITY is unset; set it to the folder of PartNet-Mobility objects")
     return Path(root)
+
+
+@pytest.fixture(scope="session")
+def config() -> Callable[[str, list[str]], Any]:
+    """Composes and checks conf/<name>.yaml with overrides, as the command of that name does."""
+
+    def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
+        store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
+        store.store(name=f"{name}_schema", node=schema)
+        store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
+        store.store(group="algo", name="imitation_schema", node=ImitationConfig)
+        with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
+            cfg = OmegaConf.to_object(compose(name, overrides))
+        validate(cfg)
+        return cfg
+
+    return composed

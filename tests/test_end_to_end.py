@@ -5,18 +5,17 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
 
 from fb3d_rl.algos.artflownet import run, run_evaluation
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.training.run_log import RunLog, read_rows
 
+Config = Callable[[str, list[str]], Any]
 CONF = str(Path(__file__).parents[1] / "conf")
 SMALL = [
     "experiment=smoke",
@@ -36,19 +35,8 @@ SMALL = [
 ]
 
 
-def config(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
-    store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
-    store.store(name=f"{name}_schema", node=schema)
-    store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
-    store.store(group="algo", name="imitation_schema", node=ImitationConfig)
-    with initialize_config_dir(CONF, version_base="1.3"):
-        cfg = OmegaConf.to_object(compose(name, overrides))
-    validate(cfg)
-    return cfg
-
-
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def first(tmp_path_factory: pytest.TempPathFactory, config: Config) -> Path:
     out = tmp_path_factory.mktemp("first")
     run(config("train", SMALL), out)
     return out
@@ -69,7 +57,7 @@ def test_a_run_leaves_what_it_promises(first: Path) -> None:
     assert "nan" not in (first / "metrics.jsonl").read_text().lower()
 
 
-def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path, config: Config) -> None:
     run(config("train", SMALL), tmp_path)
     assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
     for name in ("rows.csv", "flow_rows.csv"):
@@ -77,13 +65,13 @@ def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_another_seed_gives_other_objects_and_weights(first: Path, tmp_path: Path) -> None:
+def test_another_seed_gives_other_objects_and_weights(first: Path, tmp_path: Path, config: Config) -> None:
     run(config("train", [*SMALL, "seed=1"]), tmp_path)
     assert read_rows(tmp_path / "metrics.jsonl", times=False) != read_rows(first / "metrics.jsonl", times=False)
 
 
 @pytest.mark.slow
-def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path) -> None:
+def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path, config: Config) -> None:
     # The learning rate's cycle depends on the number of steps, so a shorter run would not do: this one is cut.
     write = RunLog.write
 
@@ -102,7 +90,7 @@ def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path) -> None:
+def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:
     same = [item for item in SMALL if not item.startswith(("algo.", "data.train_samples"))]
     run_evaluation(config("evaluate", [*same, "policy=artflownet", f"checkpoint={first / 'checkpoint.pt'}"]), tmp_path)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()

@@ -303,8 +303,7 @@ class FlowPolicy(TensorDictModuleBase):
             sideways = length(offset - (offset @ standoff) * standoff)
             goal = contact + min(o.precontact + o.funnel * sideways, highest) * standoff
             if not self._in_the_way(cloud, tip, goal):
-                straight = goal - tip
-                return min(6.0 * length(straight), o.travel_speed) * normalize(straight)
+                return self._straight(tip, goal)
 
         centre, radius = np.zeros(3), o.margin
         if len(cloud):
@@ -328,8 +327,12 @@ class FlowPolicy(TensorDictModuleBase):
             tangent = cross(normalize(turn), outward)
             around = tangent + min(max(radius - distance, -1.0), 1.0) * 4.0 * outward
             return o.travel_speed * normalize(around)
-        straight = goal - tip
-        return min(6.0 * length(straight), o.travel_speed) * normalize(straight)
+        return self._straight(tip, goal)
+
+    def _straight(self, tip: Vector, goal: Vector) -> Vector:
+        """Velocity to a goal, slower the last bit of the way."""
+        way = goal - tip
+        return min(6.0 * length(way), self.options.travel_speed) * normalize(way)
 
     def _in_the_way(self, cloud: np.ndarray, tip: Vector, goal: Vector) -> bool:
         """Whether the straight way brings the tip near to points of the cloud that it is not as near to already."""

@@ -6,16 +6,14 @@ import json
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from omegaconf import OmegaConf
 
 from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.policies.hand import VelocityLimits
@@ -23,6 +21,8 @@ from fb3d_rl.policies.learner import twist_of
 from fb3d_rl.training.checkpoint import load_checkpoint
 from fb3d_rl.training.run_log import read_rows
 
+Config = Callable[[str, list[str]], Any]
+Train = Callable[..., Path]
 ROOT = Path(__file__).parents[2]
 SMALL = [
     "experiment=smoke",
@@ -45,20 +45,15 @@ SMALL = [
 ]
 
 
-def config(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
-    store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
-    store.store(name=f"{name}_schema", node=schema)
-    store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
-    store.store(group="algo", name="imitation_schema", node=ImitationConfig)
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        cfg = OmegaConf.to_object(compose(name, overrides))
-    validate(cfg)
-    return cfg
+@pytest.fixture(scope="module")
+def train(config: Config) -> Train:
+    """Runs the small job with further overrides."""
 
+    def trained(out: Path, *overrides: str) -> Path:
+        run(config("train", [*SMALL, *overrides]), out)
+        return out
 
-def train(out: Path, *overrides: str) -> Path:
-    run(config("train", [*SMALL, *overrides]), out)
-    return out
+    return trained
 
 
 def assert_same_run(one: Path, other: Path) -> None:
@@ -73,7 +68,7 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def first(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def first(tmp_path_factory: pytest.TempPathFactory, train: Train) -> Path:
     return train(tmp_path_factory.mktemp("first"))
 
 
@@ -108,7 +103,7 @@ def test_a_row_holds_the_experts_label_whoever_acted(first: Path) -> None:
     assert not any(key[0] == "privileged" for key in rows.keys(True, True) if isinstance(key, tuple))
 
 
-def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Path) -> None:
+def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Path, train: Train) -> None:
     train(tmp_path, "algo=bc", "algo.rounds=1", "algo.labels=45", "algo.steps=4", "evaluation.expert=false")
     cloned, dagger = DemonstrationBuffer.open(tmp_path / BUFFER), DemonstrationBuffer.open(first / BUFFER)
     index = torch.arange(45)
@@ -121,7 +116,7 @@ def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Pat
     assert [row.policy for row in read_trials(tmp_path / "rows.csv")] == ["bc"]
 
 
-def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path) -> None:
+def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:
     keep = ("assets.", "data.", "camera.", "evaluation.", "env.", "experiment=")
     same = [item for item in SMALL if item.startswith(keep)]
     run_evaluation(config("evaluate", [*same, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]), tmp_path)
@@ -129,12 +124,12 @@ def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_any_number_of_workers_gives_the_same_run(first: Path, tmp_path: Path) -> None:
+def test_any_number_of_workers_gives_the_same_run(first: Path, tmp_path: Path, train: Train) -> None:
     assert_same_run(train(tmp_path, "collector=process", "collector.workers=2"), first)
 
 
 @pytest.mark.slow
-def test_collection_beside_the_fit_repeats(tmp_path: Path) -> None:
+def test_collection_beside_the_fit_repeats(tmp_path: Path, train: Train) -> None:
     beside = ["collector=process", "collector.workers=2", "algo.overlap=true", "algo.rounds=3"]
     assert_same_run(train(tmp_path / "one", *beside), train(tmp_path / "other", *beside))
 
@@ -155,7 +150,7 @@ def test_collection_beside_the_fit_repeats(tmp_path: Path) -> None:
     ],
     ids=lambda overrides: " ".join(overrides),
 )
-def test_every_variant_runs(tmp_path: Path, overrides: list[str]) -> None:
+def test_every_variant_runs(tmp_path: Path, overrides: list[str], train: Train) -> None:
     algo, *further = overrides
     train(tmp_path, algo, *further)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -181,7 +176,9 @@ KILLED = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("phase", KILLED)
-def test_a_run_killed_in_any_phase_goes_on_as_if_nothing_had_happened(first: Path, tmp_path: Path, phase: str) -> None:
+def test_a_run_killed_in_any_phase_goes_on_as_if_nothing_had_happened(
+    first: Path, tmp_path: Path, phase: str, config: Config
+) -> None:
     # In the last call to what belongs to the phase, or as near to it as can be told beforehand.
     program = f"""
 import os, pkgutil, runpy, signal, sys
