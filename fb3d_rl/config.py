@@ -43,13 +43,15 @@ class DataConfig:
     """Flow samples: fb3d_rl.data.samples.SampleOptions, their numbers and the worker processes that draw them.
 
     Attributes:
-        train_samples: samples to train on.
+        train_samples: samples to train ArtFlowNet on.
+        labels: control steps that the expert labels for imitation, in all rounds.
         eval_samples: samples per held-out object on which the flow is measured.
         workers: worker processes; null for one per core.
     """
 
     points: int
     train_samples: int
+    labels: int
     eval_samples: int
     workers: int | None
     closed_share: float
@@ -163,8 +165,7 @@ class ImitationConfig(AlgoConfig):
     """
 
     rounds: int
-    labels: int
-    steps: int
+    epochs: float
     beta: BetaConfig
     gate: GateConfig
     oracle: bool
@@ -343,7 +344,7 @@ def validate(cfg: CommandConfig) -> None:
         if isinstance(cfg.algo, ArtFlowNetConfig):
             _validate_artflownet(cfg.algo)
         elif isinstance(cfg.algo, ImitationConfig):
-            _validate_imitation(cfg.algo, cfg.collector)
+            _validate_imitation(cfg.algo, cfg.collector, cfg.data.labels)
         _at_least("data.train_samples", cfg.data.train_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
     if isinstance(cfg, EvaluateConfig) and cfg.policy.name != "expert" and not cfg.checkpoint:
@@ -392,7 +393,7 @@ def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
         _positive(f"algo.{key}", getattr(algo, key))
 
 
-def _validate_imitation(algo: ImitationConfig, collector: CollectorConfig) -> None:
+def _validate_imitation(algo: ImitationConfig, collector: CollectorConfig, labels: int) -> None:
     _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
     _one_of("algo.loss", algo.loss, ("l1", "l2", "smooth_l1"))
     _one_of("algo.beta.schedule", algo.beta.schedule, ("constant", "linear", "exponential", "first"))
@@ -400,9 +401,9 @@ def _validate_imitation(algo: ImitationConfig, collector: CollectorConfig) -> No
     _one_of("algo.gate.name", algo.gate.name, ("beta", "safe", "ensemble", "lazy", "thrifty"))
     for key in ("rounds", "members", "batch_size", "log_every"):
         _at_least(f"algo.{key}", getattr(algo, key), 1)
-    for key in ("labels", "steps"):
-        if getattr(algo, key) < algo.rounds:
-            raise UserError(f"algo.{key}={getattr(algo, key)} is less than one for each of algo.rounds={algo.rounds}")
+    _positive("algo.epochs", algo.epochs)
+    if labels < algo.rounds:
+        raise UserError(f"data.labels={labels} is less than one for each of algo.rounds={algo.rounds}")
     _at_least("algo.validate_trials", algo.validate_trials, 0)
     _at_least("algo.turn", algo.turn, 0)
     _positive("algo.lr", algo.lr)

@@ -144,7 +144,7 @@ class Run:
             self.done = Progression()
             if cfg.resume:
                 shutil.rmtree(out / BUFFER, ignore_errors=True)
-            self.buffer = DemonstrationBuffer.create(out / BUFFER, algo.labels + (len(given) if given else 0))
+            self.buffer = DemonstrationBuffer.create(out / BUFFER, cfg.data.labels + (len(given) if given else 0))
             if given is not None:
                 copy_demonstrations(given, self.buffer, self.rows)
             self.buffer.commit()
@@ -196,7 +196,7 @@ class Run:
                 """The collection of a round, ready to run beside anything else."""
                 self.set_gate(number)
                 workers.update_policy_weights_()
-                labels = share(algo.labels, algo.rounds, number)
+                labels = share(self.cfg.data.labels, algo.rounds, number)
                 task = bar.add_task(f"round {number + 1} of {algo.rounds}: labels", total=labels)
                 rng = np.random.default_rng([self.cfg.seed, 5, number])
                 advance = partial(bar.update, task)
@@ -239,7 +239,7 @@ class Run:
     def fit(self, number: int, log: RunLog) -> None:
         """Fit the learner to all rows; saves the run now and then."""
         done, before = self.done, self.steps_before(number)
-        options = fit_options(self.algo, self.cfg.seed, number)
+        options = fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, number)
 
         def checkpoint(state: dict[str, Any]) -> None:
             done.fit, done.log_rows = state, log.rows
@@ -268,12 +268,12 @@ class Run:
 
     def steps_before(self, number: int) -> int:
         """Optimizer steps of the rounds before ``number``."""
-        return sum(share(self.algo.steps, self.algo.rounds, i) for i in range(number))
+        return sum(share(total_steps(self.cfg.data.labels, self.algo), self.algo.rounds, i) for i in range(number))
 
     @property
     def labels(self) -> int:
         """The expert's labels in the buffer; demonstrations that were given are not counted."""
-        return sum(share(self.algo.labels, self.algo.rounds, i) for i in range(self.done.collected))
+        return sum(share(self.cfg.data.labels, self.algo.rounds, i) for i in range(self.done.collected))
 
     @property
     def expert_share(self) -> float:
@@ -400,10 +400,10 @@ def rows_options(algo: ImitationConfig, limits: VelocityLimits, gate: Gate) -> R
     return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], tuple(further), algo.oracle)
 
 
-def fit_options(algo: ImitationConfig, seed: int, number: int) -> FitOptions:
+def fit_options(algo: ImitationConfig, labels: int, seed: int, number: int) -> FitOptions:
     """How the learner is fitted in a round: its share of the steps, with a learning rate that rises and falls."""
     return FitOptions(
-        steps=share(algo.steps, algo.rounds, number),
+        steps=share(total_steps(labels, algo), algo.rounds, number),
         batch_size=algo.batch_size,
         lr=algo.lr,
         schedule=algo.schedule,
@@ -412,6 +412,11 @@ def fit_options(algo: ImitationConfig, seed: int, number: int) -> FitOptions:
         log_every=algo.log_every,
         checkpoint_every=algo.checkpoint_every,
     )
+
+
+def total_steps(labels: int, algo: ImitationConfig) -> int:
+    """Optimizer steps of all rounds: ``algo.epochs`` draws of each label, and one step for each round at least."""
+    return max(algo.rounds, math.ceil(algo.epochs * labels / algo.batch_size))
 
 
 def share(total: int, rounds: int, number: int) -> int:

@@ -28,8 +28,8 @@ SMALL = [
     "experiment=smoke",
     "algo=dagger",
     "algo.rounds=2",
-    "algo.labels=90",
-    "algo.steps=8",
+    "data.labels=90",
+    "algo.epochs=0.711",
     "algo.batch_size=8",
     "algo.learner.encoder=pointnet",
     "algo.learner.width=8",
@@ -104,7 +104,7 @@ def test_a_row_holds_the_experts_label_whoever_acted(first: Path) -> None:
 
 
 def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Path, train: Train) -> None:
-    train(tmp_path, "algo=bc", "algo.rounds=1", "algo.labels=45", "algo.steps=4", "evaluation.expert=false")
+    train(tmp_path, "algo=bc", "algo.rounds=1", "data.labels=45", "evaluation.expert=false")
     cloned, dagger = DemonstrationBuffer.open(tmp_path / BUFFER), DemonstrationBuffer.open(first / BUFFER)
     index = torch.arange(45)
     assert len(cloned) == 45 and cloned[index]["expert", "acts"].all()
