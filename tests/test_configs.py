@@ -97,6 +97,14 @@ def test_every_experiment_changes_something_and_is_valid(experiment: str) -> Non
     assert (cfg == compose("train")) == (experiment == "none")
 
 
+def test_the_comparison_sweeps_over_algorithms_that_there_are() -> None:
+    raw = hydra.compose("train", ["experiment=comparison"], return_hydra_config=True)
+    algos = raw.hydra.sweeper.params["algo"].split(",")
+    assert len(set(algos)) == len(algos) == 7
+    for algo in algos:
+        validate(compose("train", "experiment=comparison", f"algo={algo}"))
+
+
 def test_what_the_command_line_says_goes_before_an_experiment() -> None:
     assert compose("train", "experiment=smoke", "data.train_samples=7").data.train_samples == 7
     assert compose("evaluate", "experiment=smoke").collector.backend == "direct"

@@ -5,6 +5,7 @@ Each start costs seconds, so most of these tests are marked slow.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -93,3 +94,16 @@ def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], 
     sentence = sentence_of(launch("benchmark.py", *arguments, cwd=tmp_path))
     assert all(word in sentence for word in words), sentence
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_sweep_trains_each_and_the_report_merges_them(tmp_path: Path) -> None:
+    small = ["experiment=smoke", "data.labels=40", "evaluation.expert=false", "evaluation.trials=1"]
+    swept = launch("train.py", "-m", *small, "algo=artflownet,bc", "hydra.sweep.dir=sweep", cwd=tmp_path)
+    assert swept.returncode == 0, swept.stderr
+    runs = sorted(path.parent for path in (tmp_path / "sweep").rglob("summary.json"))
+    assert {json.loads((run / "summary.json").read_text())["policy"] for run in runs} == {"artflownet", "bc"}
+    merged = launch("report.py", "sweep", cwd=tmp_path)
+    assert merged.returncode == 0, merged.stderr
+    table = merged.stdout
+    assert "artflownet" in table and "bc" in table
