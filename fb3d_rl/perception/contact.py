@@ -13,6 +13,12 @@ from fb3d_rl.flow.rigid_motion import rigid_motion, screw
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
 
+CANDIDATES = 64
+"""Points of a cloud that are remembered as candidates."""
+
+CANDIDATE = 10
+"""Numbers of a candidate: its point (m), unit flow and standoff, 3 each, and its share of the cloud's largest flow."""
+
 
 @dataclass(frozen=True)
 class ContactOptions:
@@ -25,8 +31,9 @@ class ContactOptions:
             their mean, as a share of their mean distance.
         min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
         min_flow: share of the cloud's largest flow that a contact point must have.
-        near: what a metre from the hand counts against a point, in shares of the largest flow. It decides between
-            points that move alike, as all of a drawer's do, and shortens the way.
+        near: what a metre from the hand counts against a point, in shares of the largest flow. It makes the choice
+            depend on the place of the hand alone, little on which points the camera happens to see.
+        turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
         facing: cosine between flow and surface normal below which the hand approaches along the normal.
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
         clearance: where that cylinder starts, in front of the point, m.
@@ -44,7 +51,8 @@ class ContactOptions:
     rim: float = 0.45
     min_distance: float = 0.02
     min_flow: float = 0.5
-    near: float = 1.0
+    near: float = 3.0
+    turning: float = 0.3
     facing: float = 0.35
     hand_radius: float = 0.05
     clearance: float = 0.06
@@ -65,17 +73,18 @@ def choose_contact(
     flow: Tensor,
     camera: Tensor,
     hand: Tensor,
+    axis: Tensor,
     avoid: Tensor,
     options: ContactOptions,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Choose where to touch each cloud and from which side.
 
-    The point of largest flow is taken if it is a good place for a suction cup: the surface is flat around it (PCA
-    curvature), it is no rim of the part, the hand can come and go along with it, and it was not tried before.
-    Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is good, the demands are dropped
-    one after the other. The hand comes against the flow (I.F). Where the flow runs along the surface, as on a
-    sliding sash, or into it, it comes against the surface's normal instead; where something stands in the way, along
-    the normal or the line of sight, which is free as far as the camera sees.
+    The point of largest flow, less what the way there counts against it, is taken if it is a good place for a suction
+    cup: the surface is flat around it (PCA curvature), it is no rim of the part, the hand can come and go along with
+    it, and it was not tried before. Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is
+    good, the demands are dropped one after the other. The hand comes against the flow (I.F). Where the flow runs along
+    the surface, as on a sliding sash, or into it, it comes against the surface's normal instead; where something
+    stands in the way, along the normal or the line of sight, which is free as far as the camera sees.
 
     Args:
         points: [B, N, 3] world points, m; the ground is z = 0.
@@ -84,19 +93,22 @@ def choose_contact(
         flow: [B, N, 3] flow of the part to open, 0 elsewhere.
         camera: [B, 3] position of the camera, which tells a surface's outside.
         hand: [B, 3] position of the suction tip, m.
+        axis: [B, 3] unit direction from the tip to the hand.
         avoid: [B, N] bool, points not to be touched (tried in vain before).
         options: thresholds.
 
     Returns:
-        Contact point [B, 3], unit flow there [B, 3] and unit direction [B, 3] in which the hand stands off it. All are
-        0 for a cloud without flow.
+        Contact point [B, 3], unit flow there [B, 3], unit direction [B, 3] in which the hand stands off it, and the
+        points that would do as well [B, CANDIDATES, CANDIDATE], for :func:`best_candidate`. All are 0 for a cloud
+        without flow; so are the candidates beyond the last one.
     """
     norm = flow.norm(dim=-1)
     largest = norm.amax(-1, keepdim=True)
     cloud, seen, obstacle = points, valid, valid & ~part
     moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen
     if not len(moving):
-        return torch.zeros_like(camera), torch.zeros_like(camera), torch.zeros_like(camera)
+        nothing = torch.zeros_like(camera)
+        return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
     points, valid, part, flow, avoid, norm = (x[:, moving] for x in (points, valid, part, flow, avoid, norm))
     weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
     movable = weak & (norm >= options.min_flow * largest)
@@ -123,7 +135,8 @@ def choose_contact(
 
     smooth = (curvature <= options.curvature) & ~_rim(points, nearest, options)
     fresh = ~avoid
-    worth = norm / largest.clamp_min(1e-9) - options.near * (points - hand[:, None]).norm(dim=-1)
+    share = norm / largest.clamp_min(1e-9)
+    worth = _worth(share, points, standoff, hand, axis, options)
     peak = torch.where(movable & fresh, worth, torch.full_like(norm, -torch.inf)).argmax(-1)
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
@@ -147,8 +160,34 @@ def choose_contact(
     near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
     index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
     found = movable.any(-1)[:, None]
-    return tuple(torch.where(found, x[rows, index], torch.zeros_like(x[rows, index]))
-                 for x in (points, direction, standoff))  # type: ignore[return-value]  # fmt: skip
+    candidate = torch.cat([points, direction, standoff, share[..., None]], dim=-1)
+    *chosen, _ = torch.where(found, candidate[rows, index], 0.0).split([3, 3, 3, 1], dim=-1)
+    first = good.int().argsort(dim=-1, descending=True, stable=True)[:, :CANDIDATES]  # clouds are in random order
+    kept = gather(torch.where((good & found)[..., None], candidate, 0.0), first)
+    return *chosen, torch.nn.functional.pad(kept, (0, 0, 0, CANDIDATES - kept.shape[1]))
+
+
+def best_candidate(candidates: Tensor, hand: Tensor, axis: Tensor, options: ContactOptions) -> Tensor:
+    """The candidate [B, CANDIDATE] that is worth most to a hand that has come elsewhere meanwhile.
+
+    Args:
+        candidates: [B, CANDIDATES, CANDIDATE] of :func:`choose_contact`.
+        hand: [B, 3] position of the suction tip, m.
+        axis: [B, 3] unit direction from the tip to the hand.
+        options: thresholds.
+    """
+    points, _, standoff, share = candidates.split([3, 3, 3, 1], dim=-1)
+    worth = _worth(share.squeeze(-1), points, standoff, hand, axis, options)
+    best = worth.masked_fill(share.squeeze(-1) == 0, -torch.inf).argmax(-1)
+    return candidates[torch.arange(len(best), device=best.device), best]
+
+
+def _worth(
+    share: Tensor, points: Tensor, standoff: Tensor, hand: Tensor, axis: Tensor, options: ContactOptions
+) -> Tensor:
+    """What points [B, N] are worth to a hand: their share of the largest flow, less the way there and the turning."""
+    way = (points - hand[:, None]).norm(dim=-1)
+    return share - options.near * way - options.turning * (1 - (standoff * axis[:, None]).sum(-1))
 
 
 def _rim(points: Tensor, nearest: tuple[Tensor, Tensor], options: ContactOptions) -> Tensor:

@@ -20,7 +20,7 @@ from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
-from fb3d_rl.perception.contact import ContactOptions, choose_contact
+from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, ContactOptions, best_candidate, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
@@ -95,6 +95,8 @@ class Memory:
         came: where the tip came from, m, faded.
         tried: the last ``TRIES`` points that were tried in vain, m.
         tries: how many that were.
+        candidates: points that would have done as well as the chosen one when it was chosen
+            (:func:`~fb3d_rl.perception.contact.choose_contact`).
     """
 
     phase: int
@@ -107,6 +109,7 @@ class Memory:
     came: Vector
     tried: np.ndarray
     tries: int
+    candidates: np.ndarray
 
     def give_up(self, point: Vector) -> None:
         """Remember a point that was tried in vain."""
@@ -138,6 +141,7 @@ class FlowPolicy(TensorDictModuleBase):
         "came": ((3,), torch.float32),
         "tried": ((TRIES, 3), torch.float32),
         "tries": ((1,), torch.int64),
+        "candidates": ((CANDIDATES, CANDIDATE), torch.float32),
     }
 
     def __init__(
@@ -171,7 +175,7 @@ class FlowPolicy(TensorDictModuleBase):
 
         for i, memory in enumerate(memories):
             self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force)
-        self._choose(memories, obs, flow)
+        self._choose(memories, obs, axis, flow)
         pulls = self._flow_at(memories, obs, flow)
         clouds = self._clouds(memories, obs)
 
@@ -247,24 +251,43 @@ class FlowPolicy(TensorDictModuleBase):
                 m.standoff = hand
             m.phase = PULL
 
-    def _choose(self, memories: list[Memory], obs: TensorDictBase, flow: Tensor) -> None:
+    def choose_again(self, state: TensorDictBase, obs: TensorDictBase, where: Tensor) -> None:
+        """Send the hand, on its way to a part that nothing has moved, to what is the best candidate from where it is.
+
+        The candidates are those of the first look, when the hand hid none of them: which points are seen over its
+        shoulder changes from step to step.
+
+        Args:
+            state: as of :meth:`initial_state`; written in place.
+            obs: the contract's "observation" group.
+            where: [E, 1] bool, the environments to do so in.
+        """
+        pose = obs["tool_pose"]
+        best = best_candidate(state["candidates"], pose[..., :3], hand_axis(pose), self.options.contact)
+        for key, value in zip(("contact_point", "pull", "standoff"), best.split([3, 3, 3, 1], dim=-1), strict=False):
+            state[key] = torch.where(where, value, state[key])
+        state["phase"] = torch.where(where, TRAVEL, state["phase"])
+        state["leave"] = torch.where(where, 0.0, state["leave"])
+
+    def _choose(self, memories: list[Memory], obs: TensorDictBase, axis: Tensor, flow: Tensor) -> None:
         """Choose a contact point in the environments that are about to, and send them there."""
         rows = _in_phase(memories, SELECT)
         if not rows:
             return
         tip = obs["tool_pose"][..., :3]
-        points, valid, part, camera, hand, flow = (
-            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], tip, flow)
+        points, valid, part, camera, hand, axis, flow = (
+            _rows(x, rows)
+            for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], tip, axis, flow)
         )
         flow = torch.where((part & valid)[..., None], flow, 0.0)
         avoid = torch.zeros_like(valid)
         for k, i in enumerate(rows):
             for tried in torch.from_numpy(memories[i].tried[: memories[i].tries]).to(points):
                 avoid[k] |= (points[k] - tried).norm(dim=-1) < self.options.retry_distance
-        chosen = choose_contact(points, valid, part, flow, camera, hand, avoid, self.options.contact)
+        chosen = choose_contact(points, valid, part, flow, camera, hand, axis, avoid, self.options.contact)
         for i, *found in zip(rows, *map(_numbers, chosen), strict=True):
             memory = memories[i]
-            memory.contact_point, memory.pull, memory.standoff = found
+            memory.contact_point, memory.pull, memory.standoff, memory.candidates = found
             if memory.pull.any():
                 memory.phase = TRAVEL
 

@@ -13,9 +13,6 @@ from torch import Tensor, nn
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowPolicy
 
-CHOOSE_AGAIN = 8
-"""Steps after which an expert that looks on chooses the contact point again while the hand is on its way."""
-
 ASTRAY = 0.06
 """Distance (m) from the approach line at which it gives up the line."""
 
@@ -203,23 +200,23 @@ class InteractivePolicy(TensorDictModuleBase):
         tensordict["next", "expert", "looks_on"] = ~acts
         return tensordict
 
-    @staticmethod
-    def look_on(tensordict: TensorDictBase) -> None:
+    def look_on(self, tensordict: TensorDictBase) -> None:
         """Keep the expert from drawing conclusions from steps that the learner made, and from insisting on its plan.
 
         A learner cannot see which contact point the expert chose long ago, from elsewhere. So a label depends on what
-        can be seen: on the way the point is chosen again and again, from where the hand is by now.
+        can be seen: on the way the point is chosen again at every step, for the hand as it is by now.
         """
-        looks_on, state = tensordict["expert", "looks_on"], tensordict["policy"]
+        looks_on, state, obs = tensordict["expert", "looks_on"], tensordict["policy"], tensordict["observation"]
         if not bool(looks_on.any()):
             return
+        phase = state["phase"]
         state["idle"] = torch.where(looks_on, 0, state["idle"])
-        away = (state["phase"] == RETREAT) | (state["phase"] == RELEASE)
-        tip = tensordict["observation", "tool_pose"][..., :3]
-        offset, standoff = tip - state["contact_point"], state["standoff"]
+        away = (phase == RETREAT) | (phase == RELEASE)
+        state["phase"] = torch.where(looks_on & away, SELECT, phase)
+        state["leave"] = torch.where(looks_on & away, 0.0, state["leave"])
+        offset, standoff = obs["tool_pose"][..., :3] - state["contact_point"], state["standoff"]
         sideways = offset - (offset * standoff).sum(-1, keepdim=True) * standoff
-        astray = (state["phase"] == APPROACH) & (sideways.norm(dim=-1, keepdim=True) > ASTRAY)
-        due = (state["phase"] == TRAVEL) & (tensordict["elapsed_steps"] % CHOOSE_AGAIN == 0)
-        anew = looks_on & (away | astray | due)
-        state["phase"] = torch.where(anew, SELECT, state["phase"])
-        state["leave"] = torch.where(anew, 0.0, state["leave"])
+        astray = (phase == APPROACH) & (sideways.norm(dim=-1, keepdim=True) > ASTRAY)
+        on_the_way = looks_on & ((phase == TRAVEL) | astray)
+        if bool(on_the_way.any()):
+            self.expert.choose_again(state, obs, on_the_way)

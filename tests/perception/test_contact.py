@@ -5,7 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fb3d_rl.perception.contact import ContactOptions, choose_contact
+from fb3d_rl.perception.contact import CANDIDATES, ContactOptions, best_candidate, choose_contact
+
+TOWARDS = torch.tensor([[-1.0, 0.0, 0.0]])
+"""Axis of a hand that stands before the plate."""
 
 
 def plate(n: int = 25) -> torch.Tensor:
@@ -25,9 +28,10 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
         flow,
         camera,
         camera,
+        TOWARDS,
         nobody if avoid is None else avoid,
         ContactOptions(**options),
-    )
+    )[:3]
 
 
 def hinge_flow(points: torch.Tensor) -> torch.Tensor:
@@ -87,13 +91,14 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
     valid[:, :300] = False
     flow = hinge_flow(points)
     flow[:, :300] *= 100.0
-    contact, _, _ = choose_contact(
+    contact, *_ = choose_contact(
         points,
         valid,
         valid,
         flow,
         torch.tensor([[-3.0, 0.0, 1.0]]),
         torch.tensor([[-3.0, 0.0, 1.0]]),
+        TOWARDS,
         torch.zeros_like(valid),
         ContactOptions(min_flow=0.0),
     )
@@ -107,8 +112,8 @@ def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_l
     flow = torch.cat([hinge_flow(points), torch.zeros(1, cloud.shape[1] - points.shape[1], 3)], dim=1)
     camera = torch.tensor([[-3.0, 0.0, 4.0]])
     valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
-    contact, direction, standoff = choose_contact(
-        cloud, valid, flow.norm(dim=-1) > 0, flow, camera, camera, torch.zeros_like(valid), ContactOptions()
+    contact, direction, standoff, _ = choose_contact(
+        cloud, valid, flow.norm(dim=-1) > 0, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
     assert torch.allclose(direction[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
     assert torch.allclose(standoff, torch.nn.functional.normalize(camera - contact), atol=1e-4)
@@ -120,8 +125,8 @@ def test_the_hand_does_not_come_from_below_the_ground(height: float) -> None:
     flow = torch.tensor([0.0, 0.0, -1.0]).expand_as(points).clone()
     camera = torch.tensor([[-3.0, 0.0, 0.05]])  # seen from below
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
-    _, _, standoff = choose_contact(
-        points, valid, valid, flow, camera, camera, torch.zeros_like(valid), ContactOptions()
+    _, _, standoff, _ = choose_contact(
+        points, valid, valid, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
     assert standoff[0, 2] > -0.1
 
@@ -137,16 +142,45 @@ def test_leaves_a_point_whose_way_is_blocked_for_one_that_can_be_moved() -> None
     assert contact[0, 1] > free[0, 1] + 0.1, "nearer to the hinge than without the post"
 
 
-def test_of_points_that_move_alike_the_one_near_the_hand_is_chosen_but_no_near_one_that_moves_less() -> None:
+def test_the_point_near_the_hand_is_chosen_but_none_that_moves_little() -> None:
     points = plate()
     valid, camera = torch.ones(points.shape[:2], dtype=torch.bool), torch.tensor([[-3.0, 0.0, 1.0]])
     nobody = torch.zeros_like(valid)
-    drawer = torch.tensor([-1.0, 0.0, 0.0]).expand_as(points)
+    drawer = TOWARDS.expand_as(points)
     for side in (-1.0, 1.0):
         hand = torch.tensor([[-0.5, side, 0.5]])
-        contact, _, _ = choose_contact(points, valid, valid, drawer, camera, hand, nobody, ContactOptions())
-        assert side * contact[0, 1] > 0
+        drawn, *_ = choose_contact(points, valid, valid, drawer, camera, hand, TOWARDS, nobody, ContactOptions())
+        assert side * drawn[0, 1] > 0
         flow = hinge_flow(points)
-        door, _, _ = choose_contact(points, valid, valid, flow, camera, hand, nobody, ContactOptions())
-        largest = flow.norm(dim=-1).amax()
-        assert flow[(points == door[:, None]).all(-1)].norm() > 0.8 * largest
+        door, *_ = choose_contact(points, valid, valid, flow, camera, hand, TOWARDS, nobody, ContactOptions())
+        assert flow[(points == door[:, None]).all(-1)].norm() >= 0.5 * flow.norm(dim=-1).amax()
+
+
+def test_the_best_candidate_is_good_has_its_flow_and_is_near_to_where_the_hand_is_by_now() -> None:
+    points = plate()[:, torch.randperm(625, generator=torch.Generator().manual_seed(0))]
+    valid, camera = torch.ones(points.shape[:2], dtype=torch.bool), torch.tensor([[-3.0, 0.0, 1.0]])
+    flow = hinge_flow(points)
+    *_, candidates = choose_contact(
+        points, valid, valid, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
+    )
+    share = candidates[0, :, 9]
+    assert len(share) == CANDIDATES and ((share >= 0.5) | (share == 0)).all() and (share > 0).sum() > 20
+    for height in (0.6, 1.0, 1.4):
+        hand = torch.tensor([[-0.1, -0.3, height]])
+        point, pull, standoff, share = best_candidate(candidates, hand, TOWARDS, ContactOptions()).split(
+            [3, 3, 3, 1], 1
+        )
+        assert (point - hand).norm() < 0.25
+        here = (points == point[:, None]).all(-1)
+        torch.testing.assert_close(share, flow[here].norm(dim=-1, keepdim=True) / flow.norm(dim=-1).amax())
+        assert torch.allclose(pull, TOWARDS, atol=1e-5) and torch.allclose(standoff, TOWARDS, atol=1e-3)
+
+
+def test_the_hand_turns_no_further_than_it_has_to() -> None:
+    candidates = torch.zeros(1, CANDIDATES, 10)
+    candidates[0, :2, 3:6] = candidates[0, 0, 6:9] = TOWARDS
+    candidates[0, 1, 6:9] = torch.tensor([0.0, 1.0, 0.0])  # as near, but to be touched from the side
+    candidates[0, :2, 9] = 1.0
+    candidates[0, 0, 0] = 0.02
+    best = best_candidate(candidates, torch.tensor([[-0.3, 0.0, 0.0]]), TOWARDS, ContactOptions())
+    assert torch.equal(best, candidates[:, 0]), "the farther one, and none of the empty rows"

@@ -149,39 +149,44 @@ def test_a_learner_that_would_write_the_experts_state_is_refused() -> None:
         InteractivePolicy(expert_policy(LIMITS), learner, BetaGate())
 
 
-def looking_on(phases: list[int], step: int, sideways: float) -> TensorDict:
+def looking_on(phases: list[int], sideways: float) -> TensorDict:
     """Environments in the given phases twice: where the expert acted before, then where it looked on.
 
-    The tip is 0.3 m before the contact point and ``sideways`` (m) off the approach line.
+    The tip is 0.3 m before the contact point and ``sideways`` (m) off the approach line; one candidate is 1 m to that
+    side, another one 1 m to the other.
     """
     count = 2 * len(phases)
+    towards = torch.tensor([-1.0, 0.0, 0.0])
     td = TensorDict({"policy": FlowPolicy.initial_state((count,))}, batch_size=[count])
     td["policy", "phase"], td["policy", "idle"] = torch.tensor(phases * 2)[:, None], torch.full((count, 1), 5)
-    td["policy", "standoff"] = torch.tensor([-1.0, 0.0, 0.0]).expand(count, 3).clone()
+    td["policy", "standoff"] = td["policy", "pull"] = towards.expand(count, 3).clone()
+    for k, side in enumerate((1.0, -1.0)):
+        candidate = torch.cat([torch.tensor([0.0, side, 0.0]), towards, towards, torch.ones(1)])
+        td["policy", "candidates"][:, k] = candidate
     td["observation", "tool_pose"] = torch.tensor([-0.3, sideways, 0.0, 1.0, 0.0, 0.0, 0.0]).expand(count, 7)
-    td["elapsed_steps"] = torch.full((count, 1), step)
     td["expert", "looks_on"] = (torch.arange(count) >= len(phases))[:, None]
     return td
 
 
 @pytest.mark.parametrize(
-    ("step", "sideways", "after"),
+    ("sideways", "after"),
     [
-        (3, 0.0, [SELECT, TRAVEL, APPROACH, PULL, SELECT, SELECT]),
-        (8, 0.0, [SELECT, SELECT, APPROACH, PULL, SELECT, SELECT]),
-        (3, 0.2, [SELECT, TRAVEL, SELECT, PULL, SELECT, SELECT]),
+        (0.01, [SELECT, TRAVEL, APPROACH, PULL, SELECT, SELECT]),
+        (0.2, [SELECT, TRAVEL, TRAVEL, PULL, SELECT, SELECT]),
+        (-0.2, [SELECT, TRAVEL, TRAVEL, PULL, SELECT, SELECT]),
     ],
 )
-def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(
-    step: int, sideways: float, after: list[int]
-) -> None:
+def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(sideways: float, after: list[int]) -> None:
     phases = [SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE]
-    td = looking_on(phases, step, sideways)
+    td = looking_on(phases, sideways)
     before = td["policy"].clone()
-    InteractivePolicy.look_on(td)
+    InteractivePolicy(expert_policy(LIMITS), None, BetaGate()).look_on(td)
     assert td["policy", "phase"].flatten().tolist() == phases + after
     assert td["policy", "idle"].flatten().tolist() == [5] * 6 + [0] * 6
-    rest = [key for key in before.keys() if key not in ("phase", "idle")]
+    chosen = [phase == TRAVEL for phase in after]
+    goal = torch.where(torch.tensor(chosen), 1.0 if sideways > 0 else -1.0, 0.0)
+    assert torch.equal(td["policy", "contact_point"][6:, 1], goal), "the candidate on the side where the hand is"
+    rest = [key for key in before.keys() if key not in ("phase", "idle", "contact_point")]
     assert (td["policy"].select(*rest) == before.select(*rest)).all()
 
 
