@@ -43,14 +43,20 @@ def real_root() -> Path:
 
 
 @pytest.fixture(scope="session")
-def config() -> Callable[[str, list[str]], Any]:
+def schemas() -> None:
+    """The typed schemas that conf/ names, as the commands register them."""
+    store = ConfigStore.instance()
+    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig)):
+        store.store(name=f"{name}_schema", node=schema)
+    for kind, algo in (("artflownet", ArtFlowNetConfig), ("imitation", ImitationConfig)):
+        store.store(group="algo", name=f"{kind}_schema", node=algo)
+
+
+@pytest.fixture(scope="session")
+def config(schemas: None) -> Callable[[str, list[str]], Any]:
     """Composes and checks conf/<name>.yaml with overrides, as the command of that name does."""
 
     def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
-        store, schema = ConfigStore.instance(), {"train": TrainConfig, "evaluate": EvaluateConfig}[name]
-        store.store(name=f"{name}_schema", node=schema)
-        store.store(group="algo", name="artflownet_schema", node=ArtFlowNetConfig)
-        store.store(group="algo", name="imitation_schema", node=ImitationConfig)
         with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
             cfg = OmegaConf.to_object(compose(name, overrides))
         validate(cfg)

@@ -12,14 +12,13 @@ from typing import Any
 import hydra
 import pytest
 import yaml
-from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from fb3d_rl import config
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
+from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
@@ -41,11 +40,7 @@ TRAINING_ONLY = {"experiment/partnet"}
 
 
 @pytest.fixture(autouse=True)
-def composer() -> Iterator[None]:
-    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig)):
-        ConfigStore.instance().store(name=f"{name}_schema", node=schema)
-    for kind, algo in (("artflownet", ArtFlowNetConfig), ("imitation", ImitationConfig)):
-        ConfigStore.instance().store(group="algo", name=f"{kind}_schema", node=algo)
+def composer(schemas: None) -> Iterator[None]:
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         yield
     GlobalHydra.instance().clear()

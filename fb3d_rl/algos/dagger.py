@@ -268,7 +268,7 @@ class Run:
 
     def steps_before(self, number: int) -> int:
         """Optimizer steps of the rounds before ``number``."""
-        return sum(share(total_steps(self.cfg.data.labels, self.algo), self.algo.rounds, i) for i in range(number))
+        return sum(round_steps(self.algo, self.cfg.data.labels, i) for i in range(number))
 
     @property
     def labels(self) -> int:
@@ -403,7 +403,7 @@ def rows_options(algo: ImitationConfig, limits: VelocityLimits, gate: Gate) -> R
 def fit_options(algo: ImitationConfig, labels: int, seed: int, number: int) -> FitOptions:
     """How the learner is fitted in a round: its share of the steps, with a learning rate that rises and falls."""
     return FitOptions(
-        steps=share(total_steps(labels, algo), algo.rounds, number),
+        steps=round_steps(algo, labels, number),
         batch_size=algo.batch_size,
         lr=algo.lr,
         schedule=algo.schedule,
@@ -414,9 +414,10 @@ def fit_options(algo: ImitationConfig, labels: int, seed: int, number: int) -> F
     )
 
 
-def total_steps(labels: int, algo: ImitationConfig) -> int:
-    """Optimizer steps of all rounds: ``algo.epochs`` draws of each label, and one step for each round at least."""
-    return max(algo.rounds, math.ceil(algo.epochs * labels / algo.batch_size))
+def round_steps(algo: ImitationConfig, labels: int, number: int) -> int:
+    """A round's share of the optimizer steps: ``algo.epochs`` draws of each label in all, and at least one a round."""
+    total = max(algo.rounds, math.ceil(algo.epochs * labels / algo.batch_size))
+    return share(total, algo.rounds, number)
 
 
 def share(total: int, rounds: int, number: int) -> int:

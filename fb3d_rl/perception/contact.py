@@ -16,8 +16,10 @@ from fb3d_rl.geometry.transforms import normalize
 CANDIDATES = 64
 """Points of a cloud that are remembered as candidates."""
 
-CANDIDATE = 10
-"""Numbers of a candidate: its point (m), unit flow and standoff, 3 each, and its share of the cloud's largest flow."""
+LAYOUT = (3, 3, 3, 1)
+"""What a candidate consists of: its point (m), unit flow and standoff, and its share of the cloud's largest flow."""
+
+CANDIDATE = sum(LAYOUT)
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,8 @@ class ContactOptions:
             their mean, as a share of their mean distance.
         min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
         min_flow: share of the cloud's largest flow that a contact point must have.
-        near: what a metre from the hand counts against a point, in shares of the largest flow. It makes the choice
-            depend on the place of the hand alone, little on which points the camera happens to see.
+        near: what a metre from the hand counts against a point, in shares of the largest flow. The larger, the
+            more the choice depends on where the hand is, and the less on which points the camera happens to see.
         turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
         facing: cosine between flow and surface normal below which the hand approaches along the normal.
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
@@ -161,7 +163,7 @@ def choose_contact(
     index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
     found = movable.any(-1)[:, None]
     candidate = torch.cat([points, direction, standoff, share[..., None]], dim=-1)
-    *chosen, _ = torch.where(found, candidate[rows, index], 0.0).split([3, 3, 3, 1], dim=-1)
+    *chosen, _ = torch.where(found, candidate[rows, index], 0.0).split(LAYOUT, dim=-1)
     first = good.int().argsort(dim=-1, descending=True, stable=True)[:, :CANDIDATES]  # clouds are in random order
     kept = gather(torch.where((good & found)[..., None], candidate, 0.0), first)
     return *chosen, torch.nn.functional.pad(kept, (0, 0, 0, CANDIDATES - kept.shape[1]))
@@ -176,7 +178,7 @@ def best_candidate(candidates: Tensor, hand: Tensor, axis: Tensor, options: Cont
         axis: [B, 3] unit direction from the tip to the hand.
         options: thresholds.
     """
-    points, _, standoff, share = candidates.split([3, 3, 3, 1], dim=-1)
+    points, _, standoff, share = candidates.split(LAYOUT, dim=-1)
     worth = _worth(share.squeeze(-1), points, standoff, hand, axis, options)
     best = worth.masked_fill(share.squeeze(-1) == 0, -torch.inf).argmax(-1)
     return candidates[torch.arange(len(best), device=best.device), best]

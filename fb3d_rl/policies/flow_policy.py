@@ -20,7 +20,7 @@ from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
-from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, ContactOptions, best_candidate, choose_contact
+from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
@@ -264,7 +264,7 @@ class FlowPolicy(TensorDictModuleBase):
         """
         pose = obs["tool_pose"]
         best = best_candidate(state["candidates"], pose[..., :3], hand_axis(pose), self.options.contact)
-        for key, value in zip(("contact_point", "pull", "standoff"), best.split([3, 3, 3, 1], dim=-1), strict=False):
+        for key, value in zip(("contact_point", "pull", "standoff"), best.split(LAYOUT, dim=-1), strict=False):
             state[key] = torch.where(where, value, state[key])
         state["phase"] = torch.where(where, TRAVEL, state["phase"])
         state["leave"] = torch.where(where, 0.0, state["leave"])
