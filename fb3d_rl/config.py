@@ -23,7 +23,7 @@ class AssetsConfig:
             list of them.
         eval_split: what train.py evaluates on, likewise.
         split_file: split file in UMPNet's format; UMPNet's own lists if null.
-        categories: families of procedural objects.
+        categories: families of procedural objects; with "partnet_mobility", those that are trained on besides.
         train_count: procedural training objects of each category.
         eval_count: procedural held-out objects of each category.
     """

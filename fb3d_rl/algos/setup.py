@@ -37,6 +37,8 @@ def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entr
         made = procedural_catalog(out / "objects", assets.categories, assets.train_count, assets.eval_count, seed)
         return [e for e in made if e.split == "train_train"], [e for e in made if e.split == "train_test"]
     train = partnet_catalog(assets.root, assets.split, assets.split_file)
+    if assets.categories:
+        train += procedural_catalog(out / "objects", assets.categories, assets.train_count, 0, seed)
     return train, partnet_catalog(assets.root, assets.eval_split, assets.split_file)
 
 
