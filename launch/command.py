@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors come here as exceptions, in place of Hydra's own printout
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells about every memory map
 
 import hydra
 from hydra.core.config_store import ConfigStore

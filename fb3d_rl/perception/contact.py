@@ -53,8 +53,8 @@ class ContactOptions:
     rim: float = 0.45
     min_distance: float = 0.02
     min_flow: float = 0.5
-    near: float = 3.0
-    turning: float = 0.3
+    near: float = 10.0
+    turning: float = 1.0
     facing: float = 0.35
     hand_radius: float = 0.05
     clearance: float = 0.06

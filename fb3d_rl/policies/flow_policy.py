@@ -41,6 +41,7 @@ class FlowPolicyOptions:
         pull_speed: factor that turns the normalised flow into a tip velocity (I.G), m/s.
         angular_gain: factor that turns the rotation q_diff into an angular velocity (I.G), 1/s.
         precontact: distance (m) of the pre-contact point in front of the contact point (I.G).
+        line: how far (m) off the approach line the tip may be when it turns to the contact point.
         overshoot: how far (m) the tip may pass the contact point before the approach has failed.
         force: contact force (N) that ends an approach which does not hold.
         patience: control steps for which that force is borne, since suction may still engage.
@@ -64,6 +65,7 @@ class FlowPolicyOptions:
     pull_speed: float = 0.8
     angular_gain: float = 8.0
     precontact: float = 0.1
+    line: float = 0.06
     overshoot: float = 0.08
     force: float = 20.0
     patience: int = 4
@@ -218,7 +220,7 @@ class FlowPolicy(TensorDictModuleBase):
                 m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
             elif (
                 length(alignment(hand, m.standoff)) < 0.15
-                and length(offset - height * m.standoff) < 0.04
+                and length(offset - height * m.standoff) < o.line
                 and height > 0
             ):
                 m.phase = APPROACH

@@ -13,9 +13,6 @@ from torch import Tensor, nn
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowPolicy
 
-ASTRAY = 0.06
-"""Distance (m) from the approach line at which it gives up the line."""
-
 
 class Gate(nn.Module):
     """Decides in every step who acts: the expert or the learner.
@@ -203,8 +200,9 @@ class InteractivePolicy(TensorDictModuleBase):
     def look_on(self, tensordict: TensorDictBase) -> None:
         """Keep the expert from drawing conclusions from steps that the learner made, and from insisting on its plan.
 
-        A learner cannot see which contact point the expert chose long ago, from elsewhere. So a label depends on what
-        can be seen: on the way the point is chosen again at every step, for the hand as it is by now.
+        A learner cannot see which contact point the expert chose long ago, from elsewhere, nor whether it had begun its
+        approach. So a label depends on what can be seen: until it holds the part, the expert chooses the point and
+        whether to approach it again at every step, for the hand as it is by now.
         """
         looks_on, state, obs = tensordict["expert", "looks_on"], tensordict["policy"], tensordict["observation"]
         if not bool(looks_on.any()):
@@ -214,9 +212,6 @@ class InteractivePolicy(TensorDictModuleBase):
         away = (phase == RETREAT) | (phase == RELEASE)
         state["phase"] = torch.where(looks_on & away, SELECT, phase)
         state["leave"] = torch.where(looks_on & away, 0.0, state["leave"])
-        offset, standoff = obs["tool_pose"][..., :3] - state["contact_point"], state["standoff"]
-        sideways = offset - (offset * standoff).sum(-1, keepdim=True) * standoff
-        astray = (phase == APPROACH) & (sideways.norm(dim=-1, keepdim=True) > ASTRAY)
-        on_the_way = looks_on & ((phase == TRAVEL) | astray)
+        on_the_way = looks_on & ((phase == TRAVEL) | (phase == APPROACH))
         if bool(on_the_way.any()):
             self.expert.choose_again(state, obs, on_the_way)

@@ -22,6 +22,7 @@ from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Workers
 from fb3d_rl.evaluation.rollout import policy_env, state_of
+from fb3d_rl.perception.contact import LAYOUT
 from fb3d_rl.policies.flow_policy import (
     APPROACH,
     PULL,
@@ -171,8 +172,7 @@ def looking_on(phases: list[int], sideways: float) -> TensorDict:
 @pytest.mark.parametrize(
     ("sideways", "after"),
     [
-        (0.01, [SELECT, TRAVEL, APPROACH, PULL, SELECT, SELECT]),
-        (0.2, [SELECT, TRAVEL, TRAVEL, PULL, SELECT, SELECT]),
+        (0.01, [SELECT, TRAVEL, TRAVEL, PULL, SELECT, SELECT]),
         (-0.2, [SELECT, TRAVEL, TRAVEL, PULL, SELECT, SELECT]),
     ],
 )
@@ -188,6 +188,24 @@ def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(sid
     assert torch.equal(td["policy", "contact_point"][6:, 1], goal), "the candidate on the side where the hand is"
     rest = [key for key in before.keys() if key not in ("phase", "idle", "contact_point")]
     assert (td["policy"].select(*rest) == before.select(*rest)).all()
+
+
+def test_the_label_of_one_that_looks_on_does_not_depend_on_what_it_meant_to_do() -> None:
+    """On the way or on its approach, to whichever point: what it then sees is the same, so is its label."""
+    policy = InteractivePolicy(expert_policy(LIMITS), Learner(), BetaGate(0.0))
+    one = start(policy, scene(1))
+    one.update(policy(one.clone())["next"])
+    td = torch.cat([one] * 3)
+    state, candidates = td["policy"], one["policy", "candidates"][0]
+    assert (candidates[:, -1] > 0).sum() >= 3
+    for k, phase in enumerate((TRAVEL, APPROACH, APPROACH)):
+        state["phase"][k] = phase
+        state["contact_point"][k], state["pull"][k], state["standoff"][k], _ = candidates[k].split(LAYOUT)
+    for looks_on in (True, False):
+        td["expert", "looks_on"] = torch.full((3, 1), looks_on)
+        labels = policy(td.clone())["expert", "action"]
+        same = torch.equal(labels[0], labels[1]) and torch.equal(labels[1], labels[2])
+        assert same == looks_on
 
 
 def test_a_learner_that_stands_still_is_no_stuck_expert() -> None:
