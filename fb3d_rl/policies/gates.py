@@ -15,7 +15,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from fb3d_rl.contract import Key, UserError
-from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, HumanGate, OracleGate
+from fb3d_rl.policies.interaction import BetaGate, Gate, HumanGate
 
 EXPERT: Key = ("expert", "action")
 LEARNER: Key = ("learner", "action")
@@ -248,12 +248,11 @@ BUDGETED = ("safe", "lazy", "thrifty")
 """Those whose thresholds a budget sets."""
 
 
-def make_gate(name: str, oracle: bool = False, **options: Any) -> Gate:
+def make_gate(name: str, **options: Any) -> Gate:
     """The gate of that name.
 
     Args:
         name: one of :data:`GATES`.
-        oracle: whether the expert also acts wherever the part is not held.
         options: the gate's own; its defaults unless given.
 
     Raises:
@@ -267,8 +266,7 @@ def make_gate(name: str, oracle: bool = False, **options: Any) -> Gate:
     except TypeError as error:
         has = ", ".join(list(signature.parameters)[1:])
         raise UserError(f"the gate {name} does not take these options ({error}); it has {has}") from error
-    gate = GATES[name](**options)
-    return EitherGate(OracleGate(), gate) if oracle else gate
+    return GATES[name](**options)
 
 
 def _threshold(name: str, value: float) -> Tensor:

@@ -168,7 +168,7 @@ class InteractivePolicy(TensorDictModuleBase):
             if both:
                 raise ValueError(f"expert and learner both write {sorted(both, key=str)}")
             own.update(learner.out_keys)
-        keys += [("expert", "looks_on"), "elapsed_steps"]
+        keys.append(("expert", "looks_on"))
         self.in_keys = [key for key in dict.fromkeys(keys) if key not in own]
         self.out_keys = ["action", ("expert", "action"), ("expert", "acts"), ("next", "expert", "looks_on")]
 

@@ -201,8 +201,7 @@ def test_gates_that_take_no_budget_stay_as_they_are() -> None:
 
 
 def test_the_oracle_leads_up_to_the_hold_and_then_the_gate_decides() -> None:
-    gate = make_gate("lazy", oracle=True, beta_h=0.5, beta_r=0.2)
-    assert isinstance(gate, EitherGate)
+    gate = EitherGate(OracleGate(), make_gate("lazy", beta_h=0.5, beta_r=0.2))
     assert ("observation", "attached") in gate.in_keys and ("learner", "discrepancy") in gate.in_keys
     sequence = [steps(true=[0.9], predicted=[p]) for p in (0.0, 0.0, 0.6, 0.0)]
     for td, attached in zip(sequence, (False, True, True, True), strict=True):
@@ -229,7 +228,7 @@ def never(td: TensorDictBase) -> Tensor:
 
 @pytest.mark.parametrize("name", GATES)
 def test_every_gate_is_made_by_name_pickled_and_updated_by_weights(name: str) -> None:
-    gate = make_gate(name, oracle=True, **({"takes_over": never} if name == "human" else {}))
+    gate = EitherGate(OracleGate(), make_gate(name, **({"takes_over": never} if name == "human" else {})))
     td = frames(30, torch.Generator().manual_seed(0))
     td["observation", "attached"] = torch.ones(30, 1, dtype=torch.bool)
     td["seed"], td["elapsed_steps"] = torch.arange(30)[:, None], torch.arange(30)[:, None]

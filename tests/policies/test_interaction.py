@@ -35,7 +35,7 @@ from fb3d_rl.policies.flow_policy import (
 )
 from fb3d_rl.policies.gates import make_gate
 from fb3d_rl.policies.hand import VelocityLimits
-from fb3d_rl.policies.interaction import BetaGate, Gate, HumanGate, InteractivePolicy, OracleGate, uniform
+from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, HumanGate, InteractivePolicy, OracleGate, uniform
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 POINTS = 40
@@ -134,8 +134,8 @@ def test_without_a_learner_the_expert_acts_whatever_the_gate_says() -> None:
 
 
 def test_keys_that_come_from_outside_and_those_that_do_not() -> None:
-    policy = InteractivePolicy(expert_policy(LIMITS), Learner(), make_gate("thrifty", oracle=True))
-    outside = {"elapsed_steps", ("observation", "attached"), ("learner", "last"), ("expert", "looks_on")}
+    policy = InteractivePolicy(expert_policy(LIMITS), Learner(), EitherGate(OracleGate(), make_gate("thrifty")))
+    outside = {("observation", "attached"), ("learner", "last"), ("expert", "looks_on")}
     made = {"action", ("expert", "action"), ("learner", "action"), ("learner", "discrepancy"), ("learner", "variance")}
     assert outside <= set(policy.in_keys) and not made & set(policy.in_keys)
     given = start(policy, scene(2))
@@ -353,7 +353,7 @@ def gates() -> list[Gate]:
     return [
         BetaGate(0.4),
         BetaGate(0.4, per_step=False),
-        make_gate("safe", oracle=True),
+        EitherGate(OracleGate(), make_gate("safe")),
         make_gate("ensemble", chi=0.01, tau=9.0),
         make_gate("lazy", beta_h=0.8, beta_r=0.1),
         make_gate("thrifty", delta_h=0.019, beta_h=2.0, delta_r=9.0),
