@@ -38,10 +38,12 @@ class Round:
     Attributes:
         episodes: frames [T] with what is known about them; exactly as many as the labels asked for.
         numbers: of the whole episodes: "collect/success_rate", "collect/contact_rate", "collect/expert_share" ...
+        ended: when, on the clock of :func:`time.perf_counter`.
     """
 
     episodes: list[tuple[TensorDictBase, EpisodeInfo]]
     numbers: dict[str, float]
+    ended: float
 
 
 def collect(
@@ -98,7 +100,8 @@ def collect(
                 episodes.append((kept, info))
                 count += len(kept)
     success, contact, share = np.mean(outcomes, axis=0).tolist()
-    seconds = time.perf_counter() - started
+    ended_at = time.perf_counter()
+    seconds = ended_at - started
     numbers = {
         "collect/success_rate": success,
         "collect/contact_rate": contact,
@@ -108,7 +111,7 @@ def collect(
         "time/collect_seconds": seconds,
         "time/labels_per_s": steps / seconds,
     }
-    return Round(episodes, numbers)
+    return Round(episodes, numbers, ended_at)
 
 
 @dataclass(frozen=True)
