@@ -119,12 +119,11 @@ def _outcome(after: TensorDictBase) -> dict[str, Any]:
     """What a row says about an episode, of what each of its steps led to [T]."""
     held = after["contact"].flatten().nonzero().flatten()
     success, distance = bool(after["success"][-1]), float(after["normalized_distance"][-1])
-    opened = f"{100 * (1 - distance):.0f} % open"
     if success:
         failure = ""
     elif len(held):
         attached = bool(after["observation", "attached"][-1])
-        failure = f"held at the end, {opened}" if attached else f"lost hold, {opened}"
+        failure = "held, but not opened far enough" if attached else "lost hold"
     else:
         touched = bool((after["observation", "contact_force"] > 0).any())
         failure = "touched, but never held the part" if touched else "never touched the part"
