@@ -362,6 +362,7 @@ def validate(cfg: CommandConfig) -> None:
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
     _at_least("evaluation.trials", 0 if cfg.evaluation.trials is None else cfg.evaluation.trials, 0)
+    _at_least("evaluation.clouds", cfg.evaluation.clouds, 0)
     _at_least("evaluation.videos", cfg.evaluation.videos, 0)
     for key in ("closed_share", "others_closed", "all_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:

@@ -64,6 +64,14 @@ def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path, config: 
         assert (tmp_path / name).read_bytes() == (first / name).read_bytes(), name
 
 
+def test_a_report_without_clouds(first: Path, tmp_path: Path, config: Config) -> None:
+    alone = ["evaluation.clouds=0", "evaluation.trials=0", "policy=artflownet", f"checkpoint={first}/checkpoint.pt"]
+    small = [word for word in SMALL if not word.startswith(("algo", "evaluation"))]
+    run_evaluation(config("evaluate", [*small, *alone]), tmp_path)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names >= {"flow_rows.csv", "report.html"} and not names & {"clouds.npz", "flow.png"}
+
+
 @pytest.mark.slow
 def test_another_seed_gives_other_objects_and_weights(first: Path, tmp_path: Path, config: Config) -> None:
     run(config("train", [*SMALL, "seed=1"]), tmp_path)

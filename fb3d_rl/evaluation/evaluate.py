@@ -101,7 +101,7 @@ def evaluate(
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())
-    if net is not None:
+    if net is not None and protocol.clouds:
         write_picture(out)
     if rows and protocol.videos:
         with progress_bars() as bar:
@@ -141,7 +141,8 @@ def _measure_flow(
         rows = flow_rows(predicted, samples, about)
         if target == "part":
             measured = rows
-            _keep_clouds(out / "clouds.npz", samples, predicted, about, protocol.clouds)
+            if protocol.clouds:
+                _keep_clouds(out / "clouds.npz", samples, predicted, about, protocol.clouds)
             continue
         everything = summary([], rows)
         extra["flow_all_parts"] = {
