@@ -34,7 +34,8 @@ class ContactOptions:
         min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
         min_flow: share of the cloud's largest flow that a contact point must have.
         near: what a metre from the hand counts against a point, in shares of the largest flow. The larger, the
-            more the choice depends on where the hand is, and the less on which points the camera happens to see.
+            more the choice depends on where the hand is, and the less on which points the camera happens to see; with
+            0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
         turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
         facing: cosine between flow and surface normal below which the hand approaches along the normal.
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
@@ -81,9 +82,11 @@ def choose_contact(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Choose where to touch each cloud and from which side.
 
-    The point of largest flow, less what the way there counts against it, is taken if it is a good place for a suction
-    cup: the surface is flat around it (PCA curvature), it is no rim of the part, the hand can come and go along with
-    it, and it was not tried before. Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is
+    Of the points with at least ``min_flow`` of the largest flow the one that is worth most, foremost the nearest to
+    the hand, is taken if it is a good place for a suction cup: the surface is flat around it (PCA curvature), it is no
+    rim of the part, the hand can come and go along with it, and it was not tried before. (The supplement takes the
+    largest flow; where several points have nearly that, small differences send the hand now here, now there, and no
+    learner can follow.) Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is
     good, the demands are dropped one after the other. The hand comes against the flow (I.F). Where the flow runs along
     the surface, as on a sliding sash, or into it, it comes against the surface's normal instead; where something
     stands in the way, along the normal or the line of sight, which is free as far as the camera sees.
