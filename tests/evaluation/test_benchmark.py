@@ -62,9 +62,9 @@ def test_labelled_rows_are_those_that_the_learner_collects_alone(
     for i, episode in enumerate(episodes):
         alone, labelled = labels[i][1], labels[i][2]
         assert torch.equal(alone["observation", "points"], labelled["observation", "points"])
-        # While it follows the same states the expert would do what it did.
-        label, did = labelled["expert", "action"][:8], episode.actions[:8]
-        torch.testing.assert_close(label, did, atol=1e-5, rtol=0)
+        # In the same states the expert would do what it did, but where it meanwhile came nearer to another good point.
+        difference = (labelled["expert", "action"] - episode.actions).abs().amax(-1)
+        assert difference[0] < 1e-5 and (difference < 0.01).float().mean() > 0.9
     assert 0.2 < found["labelled / alone"] < 1.1
     assert found["labelled by the expert, rows/s"] > 0
 
