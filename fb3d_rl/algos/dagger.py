@@ -215,7 +215,7 @@ class Run:
                     self.buffer.commit()
                     done.rows, done.collected = len(self.buffer), number + 1
                     done.numbers = found.numbers | {"time/waited_for_labels": waited}
-                    if beside is not None:  # how long the environments stood still until the next round begins
+                    if beside is not None and number + 1 < algo.rounds:  # how long the environments stood still
                         done.numbers["time/waited_for_training"] = time.perf_counter() - found.ended
                     self.save()
                 if beside is not None and number + 1 < algo.rounds:
