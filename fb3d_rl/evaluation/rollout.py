@@ -50,7 +50,23 @@ def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
         state: as :func:`state_of` gives it; the flow policy's alone unless given.
     """
     start = (state_of() if state is None else state).expand(env.batch_size)
-    return TransformedEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
+    return _PolicyEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
+
+
+class _PolicyEnv(TransformedEnv):
+    """Takes the groups of state that a policy wrote below "next", each of them whole, in place of those of the last step.
+
+    TorchRL would ask of each of their keys, twice in a step, whether it is among all the keys of the environment.
+    """
+
+    def step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """See :class:`TransformedEnv`."""
+        written = tensordict.pop("next", None)
+        tensordict = super().step(tensordict)
+        after = tensordict["next"]
+        for name, group in () if written is None else written.items():
+            after[name] = group
+        return tensordict
 
 
 def _specs_of(start: TensorDictBase) -> Composite:

@@ -209,9 +209,10 @@ class InteractivePolicy(TensorDictModuleBase):
             return
         phase = state["phase"]
         state["idle"] = torch.where(looks_on, 0, state["idle"])
-        away = (phase == RETREAT) | (phase == RELEASE)
-        state["phase"] = torch.where(looks_on & away, SELECT, phase)
-        state["leave"] = torch.where(looks_on & away, 0.0, state["leave"])
+        away = looks_on & ((phase == RETREAT) | (phase == RELEASE))
+        if bool(away.any()):
+            state["phase"] = torch.where(away, SELECT, phase)
+            state["leave"] = torch.where(away, 0.0, state["leave"])
         on_the_way = looks_on & ((phase == TRAVEL) | (phase == APPROACH))
         if bool(on_the_way.any()):
             self.expert.choose_again(state, obs, on_the_way)
