@@ -10,7 +10,7 @@ import shutil
 import time
 import warnings
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -29,7 +29,7 @@ from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstra
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.samples import ObjectView
-from fb3d_rl.env.workers import Workers
+from fb3d_rl.env.workers import Workers, steady_floats
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.rollout import create_env, run_trials, state_of
 from fb3d_rl.evaluation.rows import TrialRow
@@ -184,7 +184,8 @@ class Run:
         """Run the rounds that are left."""
         done, algo = self.done, self.algo
         create = partial(create_env, tuple(self.objects), self.protocol.env, state_of(self.policy))
-        options, horizon = setup.collector_options(self.cfg), self.protocol.env.horizon
+        options = setup.collector_options(self.cfg, spare=int(algo.overlap))  # a core for the fit
+        horizon = self.protocol.env.horizon
         with ExitStack() as stack:
             log = stack.enter_context(RunLog(self.out, resume_rows=done.log_rows if self.resumed else None))
             bar = stack.enter_context(progress_bars())
@@ -250,9 +251,11 @@ class Run:
         nets = networks(self.learner).to(self.device)
         objective = imitation_objective(self.learner, self.algo, options.seed)
         labels = Labels(self.buffer, self.algo.learner.chunk)
-        fit(nets, labels, options, objective=objective, device=self.device, on_checkpoint=checkpoint, resume=done.fit,
-            log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
-            title=f"round {number + 1} of {self.algo.rounds}: fit")  # fmt: skip
+        # Threads that wait for each other on cores that collect would slow both down many times.
+        with steady_floats() if self.algo.overlap else nullcontext():
+            fit(nets, labels, options, objective=objective, device=self.device, on_checkpoint=checkpoint,
+                resume=done.fit, log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
+                title=f"round {number + 1} of {self.algo.rounds}: fit")  # fmt: skip
         nets.to("cpu")
 
     def validate(self) -> dict[str, float]:

@@ -144,10 +144,11 @@ def choose_device(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def collector_options(cfg: CommandConfig) -> CollectorOptions:
-    """Where trials run."""
+def collector_options(cfg: CommandConfig, spare: int = 0) -> CollectorOptions:
+    """Where trials run, on all cores but ``spare`` unless the configuration names a number of workers."""
     collector: Any = cfg.collector
-    return CollectorOptions(collector.backend, workers(collector.workers), collector.restarts)
+    count = max(1, workers(None) - spare) if collector.workers is None else collector.workers
+    return CollectorOptions(collector.backend, count, collector.restarts)
 
 
 def workers(count: int | None) -> int:

@@ -242,7 +242,7 @@ def fit(
         raise UserError("There are no clouds to train on: generate flow samples first.")
     model.to(device).train()
     objective = objective or flow_objective(model, options)
-    optimizer = torch.optim.Adam(model.parameters(), lr=options.lr)
+    optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
     step, loss_sum, loss_count = 0, 0.0, 0
     if resume is not None:
         _check_same_run(resume["options"], options)
