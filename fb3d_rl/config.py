@@ -24,6 +24,7 @@ class AssetsConfig:
         eval_split: what train.py evaluates on, likewise.
         split_file: split file in UMPNet's format; UMPNet's own lists if null.
         categories: families of procedural objects; with "partnet_mobility", those that are trained on besides.
+        unseen_categories: families of procedural objects that are only evaluated on, as the split "test".
         train_count: procedural training objects of each category.
         eval_count: procedural held-out objects of each category.
     """
@@ -34,6 +35,7 @@ class AssetsConfig:
     eval_split: Any
     split_file: str | None
     categories: list[str]
+    unseen_categories: list[str]
     train_count: int
     eval_count: int
 

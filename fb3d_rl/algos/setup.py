@@ -34,8 +34,11 @@ if TYPE_CHECKING:
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
     """Objects to train on and objects to evaluate on."""
     if assets.source == "procedural":
-        made = procedural_catalog(out / "objects", assets.categories, assets.train_count, assets.eval_count, seed)
-        return [e for e in made if e.split == "train_train"], [e for e in made if e.split == "train_test"]
+        unseen = assets.unseen_categories
+        made = procedural_catalog(
+            out / "objects", assets.categories, assets.train_count, assets.eval_count, seed, unseen
+        )
+        return [e for e in made if e.split == "train_train"], [e for e in made if e.split != "train_train"]
     train = partnet_catalog(assets.root, assets.split, assets.split_file)
     if assets.categories:
         train += procedural_catalog(out / "objects", assets.categories, assets.train_count, 0, seed)
@@ -45,8 +48,8 @@ def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entr
 def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
     """Objects to evaluate on."""
     if assets.source == "procedural":
-        made = procedural_catalog(out / "objects", assets.categories, 0, assets.eval_count, seed)
-        return [e for e in made if e.split == "train_test"]
+        unseen = assets.unseen_categories
+        return procedural_catalog(out / "objects", assets.categories, 0, assets.eval_count, seed, unseen)
     return partnet_catalog(assets.root, assets.split, assets.split_file)
 
 

@@ -36,22 +36,42 @@ class Entry:
         return self.known or load_object(self.folder)
 
 
-def procedural_catalog(out: Path, categories: Sequence[str], count: int, held_out: int, seed: int) -> list[Entry]:
-    """Make ``count`` training and ``held_out`` test objects (0 for none) of each category below ``out``.
+def procedural_catalog(
+    out: Path, categories: Sequence[str], count: int, held_out: int, seed: int, unseen: Sequence[str] = ()
+) -> list[Entry]:
+    """Make procedural objects below ``out``.
+
+    Args:
+        out: the folder.
+        categories: families to train on: each gives the split "train_train" ``count`` objects and "train_test"
+            ``held_out`` others; 0 for none.
+        count: see above.
+        held_out: see above.
+        seed: of the objects.
+        unseen: further families; each gives the split "test" ``held_out`` objects.
 
     Raises:
-        UserError: a category has no procedural family.
+        UserError: a category has no procedural family, or is to be trained on and unseen.
     """
-    unknown = [name for name in categories if name not in procedural.FAMILIES]
+    both = [name for name in unseen if name in categories]
+    if both:
+        raise UserError(
+            f"assets.unseen_categories: {', '.join(both)} is trained on; take it out of one of the two lists"
+        )
+    unknown = [name for name in (*categories, *unseen) if name not in procedural.FAMILIES]
     if unknown or not categories:
         wrong = ", ".join(unknown) or "the list is empty"
         raise UserError(f"assets.categories: {wrong}; choose from {', '.join(procedural.FAMILIES)}")
     entries = []
     # Held-out objects come from another seed, so no training object can be among them.
-    for split, number, part_seed in (("train_train", count, 2 * seed), ("train_test", held_out, 2 * seed + 1)):
-        if number == 0:
+    for split, names, number, part_seed in (
+        ("train_train", categories, count, 2 * seed),
+        ("train_test", categories, held_out, 2 * seed + 1),
+        ("test", unseen, held_out, 2 * seed + 1),
+    ):
+        if number == 0 or not names:
             continue
-        ids = procedural.generate(out / split, categories, number, part_seed)
+        ids = procedural.generate(out / split, names, number, part_seed)
         entries += [Entry(out / split / name, _category(out / split / name), split) for name in ids]
     return entries
 

@@ -54,7 +54,7 @@ def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
 
 
 class _PolicyEnv(TransformedEnv):
-    """Takes the groups of state that a policy wrote below "next", each of them whole, in place of those of the last step.
+    """Takes the groups of state that a policy wrote below "next", each of them whole, in place of the last step's.
 
     TorchRL would ask of each of their keys, twice in a step, whether it is among all the keys of the environment.
     """

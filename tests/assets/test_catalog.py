@@ -43,6 +43,22 @@ def test_evaluation_makes_no_training_objects_and_the_same_held_out_ones(tmp_pat
     assert contents(tmp_path / "a/train_test") == contents(tmp_path / "b/train_test")
 
 
+def test_unseen_categories_are_a_split_of_their_own(tmp_path: Path) -> None:
+    made = procedural_catalog(tmp_path / "a", ["Microwave"], 1, 2, seed=0, unseen=["Laptop", "Bucket"])
+    assert [(e.category, e.split) for e in made] == [
+        ("Microwave", "train_train"),
+        *[("Microwave", "train_test")] * 2,
+        *[("Laptop", "test")] * 2,
+        *[("Bucket", "test")] * 2,
+    ]
+    # What is held out of the training categories does not depend on them.
+    without = procedural_catalog(tmp_path / "b", ["Microwave"], 1, 2, seed=0)
+    assert [e.id for e in without] == [e.id for e in made if e.split != "test"]
+    with pytest.raises(UserError, match="Laptop is trained on"):
+        procedural_catalog(tmp_path / "c", ["Laptop"], 1, 1, seed=0, unseen=["Laptop"])
+    assert not (tmp_path / "c").exists()
+
+
 @pytest.mark.parametrize(("categories", "word"), [(["Microwave", "Spaceship"], "Spaceship"), ([], "empty")])
 def test_unknown_families_are_refused(tmp_path: Path, categories: list[str], word: str) -> None:
     with pytest.raises(UserError, match=word):
