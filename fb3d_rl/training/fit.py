@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any, Protocol, TypeAlias
 
 import torch
@@ -117,13 +118,18 @@ def generator(seed: int, purpose: int, number: int) -> torch.Generator:
     return torch.Generator().manual_seed(mixed)
 
 
+@lru_cache(maxsize=2)  # a batch is of one pass, or of the end of one and the start of the next
+def _permutation(seed: int, number: int, rows: int) -> Tensor:
+    return torch.randperm(rows, generator=generator(seed, 1, number))
+
+
 def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
     """Which rows step number ``step`` reads [batch_size]: every pass over the rows is a new permutation."""
     place = step * options.batch_size + torch.arange(options.batch_size)
     passes = place // rows
     chosen = torch.empty_like(place)
     for number in passes.unique().tolist():
-        order = torch.randperm(rows, generator=generator(options.seed, 1, number))
+        order = _permutation(options.seed, number, rows)
         here = passes == number
         chosen[here] = order[place[here] % rows]
     return chosen
