@@ -170,15 +170,16 @@ def test_joints_open_outwards(objects: list[tuple[Path, Link, list[Link]]]) -> N
             kind, name = link.semantic.split(" ")
             assert (kind, link.joint) in {("hinge", "revolute"), ("slider", "prismatic")}
             assert low == 0
-            assert (1.2 <= high <= 2.2) if kind == "hinge" else (0.15 <= high <= 1.0), (path.name, name)
+            least, most = (0.7, 1.3) if name == "lever" else (1.2, 2.2) if kind == "hinge" else (0.15, 1.0)
+            assert least <= high <= most, (path.name, name)
             assert np.linalg.norm(link.axis) == pytest.approx(1)
             points = np.concatenate([mesh.vertices for mesh in link.meshes])
             way = (link.moved(points, 0.2 * high) - points).mean(0)
-            upwards = "lid" in name or name in ("screen", "handle")
+            upwards = name.endswith("lid") or name in ("screen", "handle", "seat", "lever") or "Switch" in path.name
             if name == "translation_window":  # away from its own jamb
                 assert way[0] * points[:, 0].mean() < 0, path.name
             else:
-                assert way[1 if upwards else 2] > 0.02, (path.name, name)
+                assert way[1 if upwards else 2] > 0.01, (path.name, name)
 
 
 def test_pieces_are_convex_and_watertight(objects: list[tuple[Path, Link, list[Link]]]) -> None:
@@ -194,7 +195,7 @@ def test_pieces_are_convex_and_watertight(objects: list[tuple[Path, Link, list[L
 
 def test_bodies_are_hollow(objects: list[tuple[Path, Link, list[Link]]]) -> None:
     for path, body, movable in objects:
-        if movable[0].semantic.endswith("screen"):
+        if path.name.split("-")[1] in ("Laptop", "Phone"):
             continue
         points = np.concatenate([mesh.vertices for mesh in body.meshes])
         assert sum(mesh.volume for mesh in body.meshes) < 0.65 * np.prod(np.ptp(points, axis=0)), path

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fb3d_rl.assets.procedural import cabinets, frames, lidded
+from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
 from fb3d_rl.contract import UserError
 
@@ -37,6 +37,12 @@ FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "Box": lidded.storage_box,
     "Bucket": lidded.bucket,
     "Laptop": lidded.laptop,
+    "FoldingChair": handheld.folding_chair,
+    "Kettle": handheld.kettle,
+    "Phone": handheld.phone,
+    "Stapler": handheld.stapler,
+    "Switch": handheld.switch,
+    "Toilet": handheld.toilet,
 }
 
 
