@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, box, circle, loft, rectangle, rod, slab, wall
+from fb3d_rl.assets.procedural.shapes import Piece, box, circle, loft, rod, slab, wall
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 
