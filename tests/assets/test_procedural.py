@@ -194,7 +194,7 @@ def test_pieces_are_convex_and_watertight(objects: list[tuple[Path, Link, list[L
 
 
 def test_bodies_are_hollow(objects: list[tuple[Path, Link, list[Link]]]) -> None:
-    for path, body, movable in objects:
+    for path, body, _movable in objects:
         if path.name.split("-")[1] in ("Laptop", "Phone"):
             continue
         points = np.concatenate([mesh.vertices for mesh in body.meshes])

@@ -1,4 +1,4 @@
-"""Families of small things: kettles, staplers, phones and switches, and of what one sits on: folding chairs, toilets."""
+"""Families of small things, kettles, staplers, phones and switches, and of what one sits on: chairs, toilets."""
 
 from __future__ import annotations
 
