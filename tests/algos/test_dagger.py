@@ -170,7 +170,7 @@ KILLED = {
     "writing rows": "fb3d_rl.data.demonstrations.DemonstrationBuffer.extend",
     "closing a round": "fb3d_rl.data.demonstrations.DemonstrationBuffer.commit",
     "writing a checkpoint": "fb3d_rl.training.checkpoint.torch.save",
-    "fitting": "fb3d_rl.training.fit.generator",
+    "fitting": "fb3d_rl.training.fit.batch_rows",
     "writing the log": "fb3d_rl.training.run_log.RunLog.write",
     "validating": "fb3d_rl.algos.dagger.run_trials",
     "evaluating": "fb3d_rl.algos.dagger.evaluate",
@@ -194,7 +194,7 @@ def dies(*args, **kwargs):
     global calls
     calls += 1
     result = original(*args, **kwargs)  # the work is done, and nothing after it
-    if calls == {{"fb3d_rl.training.fit.generator": 14, "fb3d_rl.algos.dagger.evaluate": 1}}.get(target, 2):
+    if calls == {{"fb3d_rl.training.fit.batch_rows": 8, "fb3d_rl.algos.dagger.evaluate": 1}}.get(target, 2):
         os.kill(os.getpid(), signal.SIGKILL)
     return result
 setattr(owner, name, dies)
