@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,17 @@ def test_objects_are_made_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(["preview", str(made), "--out", str(sheet), "--each", "1"]) == 0
     assert "2 of 4 objects" in capsys.readouterr().out
     assert min(Image.open(sheet).size) > 100
+
+
+def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "--out", str(tmp_path), "--categories", "Phone,Switch", "--count", "1"]) == 0
+    assert main(["validate", str(tmp_path), "--workers", "1"]) == 0
+    phone, switch = json.loads((tmp_path / "validation.json").read_text())
+    assert (phone["category"], phone["usable"], phone["findings"]) == ("Phone", True, [])
+    (tmp_path / switch["id"] / "mobility.urdf").write_text("<robot>")
+    assert main(["validate", str(tmp_path), "--workers", "1", "--out", str(tmp_path / "again.json")]) == 1
+    assert "1 cannot be used" in capsys.readouterr().out
+    assert [entry["usable"] for entry in json.loads((tmp_path / "again.json").read_text())] == [True, False]
 
 
 @pytest.mark.parametrize(("word", "count", "without"), [("all", 21, ""), ("train", 11, "Box"), ("test", 10, "Laptop")])
