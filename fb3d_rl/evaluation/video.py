@@ -155,7 +155,7 @@ class Shot:
     def picture(self, t: int) -> NDArray[np.uint8]:
         """The image [H, W, 3] of moment ``t``."""
         starts, flows = self.arrows(t)
-        signs = Body([Part(_arrows(starts, self._length * flows, 0.13 * self._length), FLOW)], sign=True)
+        signs = Body([Part(arrow_mesh(starts, self._length * flows, 0.13 * self._length), FLOW)], sign=True)
         bodies = [*self._parts, *self._gripper[bool(self.film.attached[t])]]
         moving: list[Placed] = [(body, self.film.poses[t, leader]) for body, leader in bodies]
         return self._studio.picture([*moving, (signs, np.eye(4))])
@@ -209,7 +209,7 @@ _ARROW = _turned([(0, 0), (0.32, 0), (0.32, 1), (1, 1), (0, 2)], 8)
 """Shaft from height 0 to 1, head from 1 to 2; stretched for each arrow."""
 
 
-def _arrows(starts: NDArray[np.float64], vectors: NDArray[np.float64], radius: float) -> list[Mesh]:
+def arrow_mesh(starts: NDArray[np.float64], vectors: NDArray[np.float64], radius: float) -> list[Mesh]:
     """A mesh of solid arrows with that head ``radius`` from ``starts`` [A, 3] along ``vectors`` [A, 3], m."""
     length = np.linalg.norm(vectors, axis=-1)[:, None]
     size = np.minimum(radius, length / 3)
@@ -228,7 +228,7 @@ def _arrows(starts: NDArray[np.float64], vectors: NDArray[np.float64], radius: f
 # ------------------------------------------------------------------------------------------------------ captions
 
 
-def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """A font that comes with matplotlib, so that pictures are the same on all machines."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(os.path.join(matplotlib.get_data_path(), "fonts", "ttf", name), size)
@@ -246,7 +246,7 @@ def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -
     """The film's pictures of that ``size`` with a caption below each: one for each moment, [H + CAPTION, W, 3]."""
     shot = Shot(film, *size, view)
     width, height = size
-    small, usual = _font(12), _font(13)
+    small, usual = font(12), font(13)
     middle = height + CAPTION // 2 + 2
     for t in range(len(film)):
         image = Image.new("RGB", (width, height + CAPTION), "white")
@@ -375,7 +375,7 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
     side = (width - gap * (len(shown) - 1)) // len(shown)
     shot = Shot(film, 2 * side, view=view)
     tall = shot.camera.size[1] // 2
-    bold, usual = _font(width // 100, bold=True), _font(width // 114)
+    bold, usual = font(width // 100, bold=True), font(width // 114)
     top = round(1.4 * line)
     image = Image.new("RGB", (width, top + tall + 3 * line), "white")
     draw = ImageDraw.Draw(image)

@@ -57,15 +57,30 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     Raises:
         UserError: If the category has no family or the seed is negative.
     """
-    if category not in FAMILIES:
-        raise UserError(f"No procedural family for category {category!r}: choose among {', '.join(FAMILIES)}.")
-    if seed < 0:
-        raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
+    check([category], 1, seed)
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
     return FAMILIES[category](rng).normalised()
 
 
-def generate(out: Path, categories: Sequence[str], count: int, seed: int) -> list[str]:
+def check(categories: Sequence[str], count: int, seed: int) -> None:
+    """Refuse what cannot be generated before anything is written.
+
+    Raises:
+        UserError: A category has no family, the count is below 1 or the seed is negative.
+    """
+    unknown = [name for name in categories if name not in FAMILIES]
+    if unknown or not categories:
+        wrong = f"No procedural family for category {unknown[0]!r}" if unknown else "No category was named"
+        raise UserError(f"{wrong}: choose among {', '.join(FAMILIES)}.")
+    if count < 1:
+        raise UserError(f"{count} procedural objects per category were asked for: ask for at least 1.")
+    if seed < 0:
+        raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
+
+
+def generate(
+    out: Path, categories: Sequence[str], count: int, seed: int, progress: Callable[[], None] = lambda: None
+) -> list[str]:
     """Write `count` objects of each category as out/<id>/ in PartNet-Mobility's layout.
 
     The same arguments give the same bytes. An object's folder appears complete or not at all; one that is
@@ -76,6 +91,7 @@ def generate(out: Path, categories: Sequence[str], count: int, seed: int) -> lis
         categories: Keys of `FAMILIES`.
         count: Objects per category.
         seed: Seed of the whole set, at least 0.
+        progress: Called after each object.
 
     Returns:
         The ids, by category, then index.
@@ -83,8 +99,7 @@ def generate(out: Path, categories: Sequence[str], count: int, seed: int) -> lis
     Raises:
         UserError: If a category has no family, the count is below 1 or the seed is negative.
     """
-    if count < 1:
-        raise UserError(f"{count} procedural objects per category were asked for: ask for at least 1.")
+    check(categories, count, seed)
     out.mkdir(parents=True, exist_ok=True)
     ids = []
     for category in categories:
@@ -99,4 +114,5 @@ def generate(out: Path, categories: Sequence[str], count: int, seed: int) -> lis
                     shutil.rmtree(out / name)
                 folder.rename(out / name)
             ids.append(name)
+            progress()
     return ids

@@ -1,0 +1,169 @@
+"""Make procedural objects, look at objects, and find out what is wrong with them.
+
+python launch/objects.py generate --out DIR [--categories all|train|test|NAME,...] [--count 50] [--seed 0]
+python launch/objects.py validate DIR [--out FILE.json] [--workers N]
+python launch/objects.py preview DIR --out FILE.png|html [--split SPLIT] [--each N]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code (1: validate found an object that is broken; 2: a mistake)."""
+    options = _parser().parse_args(arguments)
+    # Imported late: --help answers at once.
+    from fb3d_rl.contract import UserError
+
+    try:
+        return COMMANDS[options.command](options) or 0
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        if error.filename is None:
+            raise
+        print(f"error: {error.filename} cannot be written or read ({error.strerror})", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("error: interrupted; objects that were finished are kept", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    says = "write procedural objects as PartNet-Mobility folders DIR/<id>"
+    make = commands.add_parser("generate", help=says, description=says)
+    make.add_argument("--out", type=Path, required=True, metavar="DIR")
+    make.add_argument(
+        "--categories", default="all", help="all, train or test (UMPNet's), or names with commas (default: all)"
+    )
+    make.add_argument("--count", type=int, default=50, help="objects of each category (default: 50)")
+    make.add_argument("--seed", type=int, default=0)
+
+    says = "list what is wrong with the objects below DIR; the exit code is 1 if one of them cannot be used"
+    check = commands.add_parser("validate", help=says, description=says)
+    check.add_argument("dir", type=Path, metavar="DIR")
+    check.add_argument("--out", type=Path, help="file to write (default: DIR/validation.json)")
+    check.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
+
+    says = "draw the objects below DIR, closed and open, with their joint axes"
+    show = commands.add_parser("preview", help=says, description=says)
+    show.add_argument("dir", type=Path, metavar="DIR")
+    show.add_argument("--out", type=Path, required=True, help="file to write: .png or .html")
+    show.add_argument("--split", default="all", help="a split, categories or ids, with commas (default: all)")
+    show.add_argument("--each", type=int, default=8, help="at most so many of each category (default: 8)")
+    return parser
+
+
+def generate(options: argparse.Namespace) -> None:
+    """Write procedural objects."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from fb3d_rl.assets import procedural
+    from fb3d_rl.assets.splits import TRAIN_CATEGORIES
+
+    named = {
+        "all": list(procedural.FAMILIES),
+        "train": [name for name in procedural.FAMILIES if name in TRAIN_CATEGORIES],
+        "test": [name for name in procedural.FAMILIES if name not in TRAIN_CATEGORIES],
+    }
+    categories = named.get(options.categories) or list(filter(None, options.categories.split(",")))
+    procedural.check(categories, options.count, options.seed)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as bar:
+        task = bar.add_task("objects", total=len(categories) * options.count)
+        for category in categories:
+            bar.update(task, description=category)
+            procedural.generate(options.out, [category], options.count, options.seed, lambda: bar.advance(task))
+        bar.update(task, description="objects")
+    print(f"{len(categories) * options.count} objects of {len(categories)} categories: {options.out}")
+
+
+def preview(options: argparse.Namespace) -> None:
+    """Draw a contact sheet."""
+    from collections import Counter
+
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from fb3d_rl.assets.catalog import partnet_catalog
+    from fb3d_rl.contract import UserError
+    from fb3d_rl.evaluation import preview
+
+    if options.out.suffix not in (".png", ".html"):
+        raise UserError(f"--out {options.out} is neither a .png nor a .html file; give one of them")
+    if options.each < 1:
+        raise UserError(f"--each {options.each} is too small; give 1 or more")
+    entries = sorted(partnet_catalog(str(options.dir), options.split), key=lambda entry: (entry.category, entry.id))
+    seen: Counter[str] = Counter()
+    objects = []
+    for entry in entries:
+        seen[entry.category] += 1
+        if seen[entry.category] <= options.each:
+            objects.append(entry.load())
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns) as bar:
+        pictures = [preview.picture(obj) for obj in bar.track(objects, description="pictures")]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    preview.write_sheet(objects, options.out, f"Objects of {options.dir.resolve().name}", pictures)
+    print(f"wrote {options.out}: {len(objects)} of {len(entries)} objects")
+
+
+def validate(options: argparse.Namespace) -> int:
+    """List flaws."""
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    from rich import box
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.table import Table
+
+    from fb3d_rl.assets.partnet_mobility import find_ids
+    from fb3d_rl.contract import UserError
+    from fb3d_rl.flow.validation import Verdict, examine
+
+    if options.workers < 1:
+        raise UserError(f"--workers {options.workers} is too small; give 1 or more")
+    folders = [options.dir / name for name in find_ids(options.dir)]
+    verdicts: list[Verdict] = []
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    # Spawned: a forked process would inherit torch's threads in the middle of what they do.
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool, Progress(*columns) as bar:
+        verdicts += bar.track(pool.map(examine, folders), total=len(folders), description="objects")
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ("object", "category", "parts that open", "what is wrong"):
+        table.add_column(name, overflow="fold")
+    for verdict in verdicts:
+        texts = [f"[red]{item.what}[/red]" if item.serious else item.what for item in verdict.findings]
+        table.add_row(verdict.id, verdict.category, str(verdict.openable), "\n".join(texts))
+    Console().print(table)
+    broken = [verdict for verdict in verdicts if not verdict.usable]
+    out = options.out or options.dir / "validation.json"
+    part = out.with_suffix(".part")
+    part.write_text(json.dumps([verdict.entry() for verdict in verdicts], indent=1))
+    os.replace(part, out)
+    noted = sum(bool(verdict.findings) for verdict in verdicts) - len(broken)
+    print(f"{len(verdicts)} objects: {len(broken)} cannot be used (red), {noted} more with a remark; wrote {out}")
+    return 1 if broken else 0
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
+    "generate": generate,
+    "validate": validate,
+    "preview": preview,
+}
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,61 @@
+"""launch/objects.py: objects are made and drawn, and mistakes are named before anything is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from fb3d_rl.assets.partnet_mobility import find_ids, load_object
+from launch.objects import main
+
+
+def test_objects_are_made_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = tmp_path / "made"
+    assert main(["generate", "--out", str(made), "--categories", "Phone,Switch", "--count", "2", "--seed", "4"]) == 0
+    assert "4 objects of 2 categories" in capsys.readouterr().out
+    objects = [load_object(made / name) for name in find_ids(made)]
+    assert sorted(obj.category for obj in objects) == ["Phone", "Phone", "Switch", "Switch"]
+
+    sheet = tmp_path / "below" / "sheet.png"
+    assert main(["preview", str(made), "--out", str(sheet), "--each", "1"]) == 0
+    assert "2 of 4 objects" in capsys.readouterr().out
+    assert min(Image.open(sheet).size) > 100
+
+
+def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "--out", str(tmp_path), "--categories", "Phone,Switch", "--count", "1"]) == 0
+    assert main(["validate", str(tmp_path), "--workers", "1"]) == 0
+    phone, switch = json.loads((tmp_path / "validation.json").read_text())
+    assert (phone["category"], phone["usable"], phone["findings"]) == ("Phone", True, [])
+    (tmp_path / switch["id"] / "mobility.urdf").write_text("<robot>")
+    assert main(["validate", str(tmp_path), "--workers", "1", "--out", str(tmp_path / "again.json")]) == 1
+    assert "1 cannot be used" in capsys.readouterr().out
+    assert [entry["usable"] for entry in json.loads((tmp_path / "again.json").read_text())] == [True, False]
+
+
+@pytest.mark.parametrize(("word", "count", "without"), [("all", 21, ""), ("train", 11, "Box"), ("test", 10, "Laptop")])
+def test_categories_by_split(tmp_path: Path, word: str, count: int, without: str) -> None:
+    assert main(["generate", "--out", str(tmp_path), "--categories", word, "--count", "1"]) == 0
+    categories = {name.split("-")[1] for name in find_ids(tmp_path)}
+    assert len(categories) == count and without not in categories
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["generate", "--out", "OUT", "--categories", "Spoon"], "Spoon"),
+        (["generate", "--out", "OUT", "--count", "0"], "at least 1"),
+        (["generate", "--out", "OUT", "--seed", "-1"], "seed"),
+        (["preview", "OUT", "--out", "sheet.png"], "is no folder"),
+        (["preview", "OUT", "--out", "sheet.jpg"], ".png"),
+        (["preview", "OUT", "--out", "sheet.png", "--each", "0"], "--each"),
+    ],
+)
+def test_mistakes(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], says: str) -> None:
+    assert main([str(tmp_path / "out") if word == "OUT" else word for word in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and says in error and error.count("\n") == 1
+    assert not any(tmp_path.iterdir())
