@@ -7,6 +7,8 @@ N is the number of points of a cloud (1200 unless configured otherwise).
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -21,6 +23,30 @@ class UserError(Exception):
 
     Commands print the message alone and end with exit code 2.
     """
+
+
+def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
+    """Run a command and turn what the user can mend into one sentence on stderr.
+
+    Args:
+        work: the command; returns its exit code, or None for 0.
+        interrupted: what Ctrl-C leaves behind.
+
+    Returns:
+        The exit code: 2 after an error.
+    """
+    try:
+        return work() or 0
+    except UserError as error:
+        sentence = str(error)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sentence = f"{error.filename} cannot be written or read ({error.strerror})"
+    except KeyboardInterrupt:
+        sentence = f"interrupted; {interrupted}"
+    print(f"error: {sentence}", file=sys.stderr)
+    return 2
 
 
 Key = str | tuple[str, ...]

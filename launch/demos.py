@@ -29,22 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (2: an error that the user can mend)."""
     options = _parser().parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.contract import exit_code
 
-    try:
-        COMMANDS[options.command](options)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        if error.filename is None:
-            raise
-        print(f"error: {error.filename} cannot be written or read ({error.strerror})", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted; episodes that record had finished are kept", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code(
+        lambda: COMMANDS[options.command](options), interrupted="episodes that record had finished are kept"
+    )
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -19,22 +19,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (1: validate found an object that is broken; 2: a mistake)."""
     options = _parser().parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.contract import exit_code
 
-    try:
-        return COMMANDS[options.command](options) or 0
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        if error.filename is None:
-            raise
-        print(f"error: {error.filename} cannot be written or read ({error.strerror})", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted; objects that were finished are kept", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code(lambda: COMMANDS[options.command](options), interrupted="objects that were finished are kept")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -69,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def generate(options: argparse.Namespace) -> None:
     """Write procedural objects."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress
 
     from fb3d_rl.assets import procedural
     from fb3d_rl.assets.splits import TRAIN_CATEGORIES
@@ -81,8 +68,7 @@ def generate(options: argparse.Namespace) -> None:
     }
     categories = named.get(options.categories) or list(filter(None, options.categories.split(",")))
     procedural.check(categories, options.count, options.seed)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as bar:
+    with Progress() as bar:
         task = bar.add_task("objects", total=len(categories) * options.count)
         for category in categories:
             bar.update(task, description=category)
@@ -95,7 +81,7 @@ def preview(options: argparse.Namespace) -> None:
     """Draw a contact sheet."""
     from collections import Counter
 
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import track
 
     from fb3d_rl.assets.catalog import partnet_catalog
     from fb3d_rl.contract import UserError
@@ -112,9 +98,7 @@ def preview(options: argparse.Namespace) -> None:
         seen[entry.category] += 1
         if seen[entry.category] <= options.each:
             objects.append(entry.load())
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns) as bar:
-        pictures = [preview.picture(obj) for obj in bar.track(objects, description="pictures")]
+    pictures = [preview.picture(obj) for obj in track(objects, "pictures")]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     preview.write_sheet(objects, options.out, f"Objects of {options.dir.resolve().name}", pictures)
     print(f"wrote {options.out}: {len(objects)} of {len(entries)} objects")
@@ -127,21 +111,20 @@ def validate(options: argparse.Namespace) -> int:
 
     from rich import box
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import track
     from rich.table import Table
 
     from fb3d_rl.assets.partnet_mobility import find_ids
     from fb3d_rl.contract import UserError
-    from fb3d_rl.flow.validation import Verdict, examine
+    from fb3d_rl.evaluation.rows import write_text
+    from fb3d_rl.flow.validation import examine
 
     if options.workers < 1:
         raise UserError(f"--workers {options.workers} is too small; give 1 or more")
     folders = [options.dir / name for name in find_ids(options.dir)]
-    verdicts: list[Verdict] = []
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     # Spawned: a forked process would inherit torch's threads in the middle of what they do.
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool, Progress(*columns) as bar:
-        verdicts += bar.track(pool.map(examine, folders), total=len(folders), description="objects")
+    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
+        verdicts = list(track(pool.map(examine, folders), "objects", len(folders)))
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("object", "category", "parts that open", "what is wrong"):
         table.add_column(name, overflow="fold")
@@ -151,9 +134,7 @@ def validate(options: argparse.Namespace) -> int:
     Console().print(table)
     broken = [verdict for verdict in verdicts if not verdict.usable]
     out = options.out or options.dir / "validation.json"
-    part = out.with_suffix(".part")
-    part.write_text(json.dumps([verdict.entry() for verdict in verdicts], indent=1))
-    os.replace(part, out)
+    write_text(out, json.dumps([verdict.entry() for verdict in verdicts], indent=1) + "\n")
     noted = sum(bool(verdict.findings) for verdict in verdicts) - len(broken)
     print(f"{len(verdicts)} objects: {len(broken)} cannot be used (red), {noted} more with a remark; wrote {out}")
     return 1 if broken else 0

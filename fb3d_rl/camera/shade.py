@@ -69,9 +69,9 @@ def srgb(code: str) -> Color:
 STATIC, MOVABLE, TARGET, GRIPPER = srgb("#cdd2d9"), srgb("#aebccd"), srgb("#3f7fd0"), srgb("#3a3f47")
 
 
-def link_colors(obj: ArticulatedObject, link: int) -> list[Color]:
-    """Colors of the object's links: what ``link`` carries, what else can move, what stands."""
-    target = set(obj.descendants(link))
+def link_colors(obj: ArticulatedObject, *links: int) -> list[Color]:
+    """Colors of the object's links: what ``links`` carry, what else can move, what stands."""
+    target = {i for each in links for i in obj.descendants(each)}
     movable = {i for each in obj.movable for i in obj.descendants(each)}
     return [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(len(obj.links))]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import io
-import os
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
@@ -15,9 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.camera.shade import MOVABLE, STATIC, TARGET, Body, Camera, Part, Studio, srgb
+from fb3d_rl.camera.shade import Body, Camera, Part, Studio, link_colors, srgb
 from fb3d_rl.camera.views import View
 from fb3d_rl.evaluation import page
+from fb3d_rl.evaluation.rows import write_bytes
 from fb3d_rl.evaluation.video import FAINT, INK, arrow_mesh, font
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
@@ -42,13 +42,11 @@ def picture(obj: ArticulatedObject) -> NDArray[np.uint8]:
     """
     tree, stand = KinematicTree.from_object(obj), standing_pose(obj)
     openable = openable_links(obj)
-    target = {i for link in openable for i in obj.descendants(link)}
-    movable = {i for link in obj.movable for i in obj.descendants(link)}
     closed, opened = opening_range(obj)
     moves = np.array([link in openable for link in obj.movable], dtype=bool)
     states = [closed, np.where(moves, opened, closed)]
     poses = [stand @ tree.forward(torch.as_tensor(state)).numpy() for state in states]
-    colors = [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(len(obj.links))]
+    colors = link_colors(obj, *openable)
     bodies = [
         Body(Part(link.visuals, *look) for link, *look in zip(obj.links, colors, pose, strict=True)) for pose in poses
     ]
@@ -118,9 +116,7 @@ def write_sheet(
         buffer = io.BytesIO()
         _image(groups).save(buffer, "png")
         content = buffer.getvalue()
-    part = out.with_suffix(out.suffix + ".part")
-    part.write_bytes(content)
-    os.replace(part, out)
+    write_bytes(out, content)
 
 
 Groups = list[tuple[str, list[tuple[ArticulatedObject, NDArray[np.uint8]]]]]

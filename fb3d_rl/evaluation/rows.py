@@ -111,8 +111,13 @@ _BOOLEANS = {"True": True, "False": False}
 def write_text(path: Path, text: str) -> None:
     """Replace ``path`` by ``text`` (UTF-8) in one step: readers see the old or the new file, never half."""
     # surrogateescape: error texts may quote file names whose bytes are not valid UTF-8.
+    write_bytes(path, text.encode("utf-8", "surrogateescape"))
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """The same for ``content`` as it is."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_bytes(text.encode("utf-8", "surrogateescape"))
+    beside.write_bytes(content)
     os.replace(beside, path)
 
 

@@ -135,27 +135,31 @@ def _blocked(obj: ArticulatedObject) -> Iterable[Finding]:
             for mesh in other.visuals
             if (hull := _half_spaces(mesh, at_rest[i])) is not None
         ]
-        joint, worst = obj.movable.index(link), 0.0
-        before = _inside(_samples(own, at_rest), hulls)
+        joint, worst, samples = obj.movable.index(link), 0.0, _samples(own)
+        before = _inside(_placed(samples, at_rest), hulls)
         for share in SHARES:
             state = closed.copy()
             state[joint] += share * (opened[joint] - closed[joint])
-            now = _inside(_samples(own, tree.forward(torch.as_tensor(state)).numpy()), hulls)
+            now = _inside(_placed(samples, tree.forward(torch.as_tensor(state)).numpy()), hulls)
             worst = max(worst, float((now & ~before.any(0)).any(1).mean()) if now.size else 0.0)
         if worst > BLOCKED:
             name = f"{obj.links[link].name} ({obj.links[link].semantic or 'no name'})"
             yield Finding(f"{name}: {worst:.0%} of it runs into other parts while it opens", serious=False)
 
 
-def _samples(meshes: list[tuple[int, Mesh]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points [S, 3] spread over the meshes of links at ``poses`` [L, 4, 4]; the same ones at every call."""
-    points = []
+def _samples(meshes: list[tuple[int, Mesh]]) -> list[tuple[int, NDArray[np.float64]]]:
+    """Points [., 3] spread over each mesh, in its link's frame, with the link."""
+    count, samples = max(3, SAMPLES // len(meshes)), []
     for i, mesh in meshes:
-        count = max(3, SAMPLES // len(meshes))
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
         found, _ = trimesh.sample.sample_surface(solid, count, seed=0)
-        points.append(np.asarray(found) @ poses[i, :3, :3].T + poses[i, :3, 3])
-    return np.concatenate(points)
+        samples.append((i, np.asarray(found)))
+    return samples
+
+
+def _placed(samples: list[tuple[int, NDArray[np.float64]]], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """All samples [S, 3] where the links stand at ``poses`` [L, 4, 4]."""
+    return np.concatenate([points @ poses[i, :3, :3].T + poses[i, :3, 3] for i, points in samples])
 
 
 def _half_spaces(mesh: Mesh, pose: NDArray[np.float64]) -> NDArray[np.float64] | None:

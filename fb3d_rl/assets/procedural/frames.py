@@ -13,7 +13,7 @@ from fb3d_rl.assets.procedural.fronts import (
     panel,
     swing_room,
 )
-from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, rod
+from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, housing, rod
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 
@@ -122,11 +122,7 @@ def washing_machine(rng: np.random.Generator) -> ObjectSpec:
     hole = 0.68 * radius  # half side of the square opening, which the round door covers
     front = (z[1] - sheet, z[1])
     body = [
-        box("side_panel", (x[0], x[0] + sheet), y, (z[0], front[0])),
-        box("side_panel", (x[1] - sheet, x[1]), y, (z[0], front[0])),
-        box("bottom_panel", (x[0] + sheet, x[1] - sheet), (0.0, sheet), (z[0], front[0])),
-        box("top_panel", (x[0] + sheet, x[1] - sheet), (height - sheet, height), (z[0], front[0])),
-        box("back_panel", (x[0] + sheet, x[1] - sheet), (sheet, height - sheet), (z[0], z[0] + sheet)),
+        *housing(x, y, (z[0], front[0]), sheet),
         box("front_panel", (x[0], cx - hole), y, front),
         box("front_panel", (cx + hole, x[1]), y, front),
         box("front_panel", (cx - hole, cx + hole), (0.0, cy - hole), front),

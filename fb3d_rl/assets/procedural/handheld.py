@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, box, circle, loft, rod, slab, wall
+from fb3d_rl.assets.procedural.shapes import Piece, box, circle, housing, loft, rod, slab, wall
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 
@@ -141,11 +141,7 @@ def switch(rng: np.random.Generator) -> ObjectSpec:
     slides = rng.random() < 0.5
     low, high = height * rng.uniform(0.2, 0.3), height * rng.uniform(0.7, 0.8)
     body = [
-        box("side_panel", (x[0], x[0] + sheet), y, (z[0], front[0])),
-        box("side_panel", (x[1] - sheet, x[1]), y, (z[0], front[0])),
-        box("bottom_panel", (x[0] + sheet, x[1] - sheet), (0.0, sheet), (z[0], front[0])),
-        box("top_panel", (x[0] + sheet, x[1] - sheet), (height - sheet, height), (z[0], front[0])),
-        box("back_panel", (x[0] + sheet, x[1] - sheet), (sheet, height - sheet), (z[0], z[0] + sheet)),
+        *housing(x, y, (z[0], front[0]), sheet),
         box("switch_frame", x, (0.0, low), front),
         box("switch_frame", x, (high, height), front),
     ]

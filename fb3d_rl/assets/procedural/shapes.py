@@ -77,6 +77,18 @@ def box(name: str, x: Range, y: Range, z: Range) -> Piece:
     return loft(name, [(a, y[0], b) for a, b in floor], [(a, y[1], b) for a, b in floor])
 
 
+def housing(x: Range, y: Range, z: Range, sheet: float) -> list[Piece]:
+    """Five panels, ``sheet`` m thick, of a hollow box that is open at the front."""
+    inner = (x[0] + sheet, x[1] - sheet)
+    return [
+        box("side_panel", (x[0], inner[0]), y, z),
+        box("side_panel", (inner[1], x[1]), y, z),
+        box("bottom_panel", inner, (y[0], y[0] + sheet), z),
+        box("top_panel", inner, (y[1] - sheet, y[1]), z),
+        box("back_panel", inner, (y[0] + sheet, y[1] - sheet), (z[0], z[0] + sheet)),
+    ]
+
+
 def circle(sides: int, phase: float = 0.5) -> npt.NDArray[np.float64]:
     """Corners [sides, 2] of a regular polygon on the unit circle; phase 0.5 lays its flats along the axes."""
     angle = 2 * np.pi * (np.arange(sides) + phase) / sides
