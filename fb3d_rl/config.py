@@ -5,7 +5,6 @@ The values stand in conf/*.yaml, the meaning of each key in the docstring of the
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,11 +17,12 @@ class AssetsConfig:
 
     Attributes:
         source: "procedural" (made on the fly) or "partnet_mobility" (read below ``root``).
-        root: folder with ``<id>/mobility.urdf``.
-        split: what to train on (train.py) or evaluate on (evaluate.py): "all", a split, a category, an object id, or a
-            list of them.
+        root: folder that holds ``<id>/mobility.urdf`` or ``<Category>/<id>/mobility.urdf``, or "maniskill" for
+            ManiSkill's asset folder.
+        split: what to train on (train.py) or evaluate on (evaluate.py): "all", a split, a category, an object id, a
+            file of such words (.txt, .json), or a list of them.
         eval_split: what train.py evaluates on, likewise.
-        split_file: split file in UMPNet's format; UMPNet's own lists if null.
+        split_file: split file in UMPNet's format; if null, root/split-full.json, else UMPNet's own lists.
         categories: families of procedural objects; with "partnet_mobility", those that are trained on besides.
         unseen_categories: families of procedural objects that are only evaluated on, as the split "test".
         train_count: procedural training objects of each category.
@@ -382,8 +382,6 @@ def validate(cfg: CommandConfig) -> None:
             raise UserError(
                 "assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR"
             )
-        if not os.path.isdir(cfg.assets.root):
-            raise UserError(f"assets.root={cfg.assets.root} is no folder; give the one that holds <id>/mobility.urdf")
 
 
 def _validate_artflownet(algo: ArtFlowNetConfig) -> None:

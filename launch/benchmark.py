@@ -58,8 +58,8 @@ def run(options: argparse.Namespace) -> None:
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
     from fb3d_rl.evaluation import benchmark
-    from fb3d_rl.evaluation.rows import write_text
     from fb3d_rl.evaluation.trials import schedule
+    from fb3d_rl.files import write_text
     from fb3d_rl.flow.opening import openable_links
     from fb3d_rl.training.checkpoint import git_revision
 

@@ -114,14 +114,14 @@ def validate(options: argparse.Namespace) -> int:
     from rich.progress import track
     from rich.table import Table
 
-    from fb3d_rl.assets.partnet_mobility import find_ids
+    from fb3d_rl.assets.folders import find_folders
     from fb3d_rl.contract import UserError
-    from fb3d_rl.evaluation.rows import write_text
+    from fb3d_rl.files import write_text
     from fb3d_rl.flow.validation import examine
 
     if options.workers < 1:
         raise UserError(f"--workers {options.workers} is too small; give 1 or more")
-    folders = [options.dir / name for name in find_ids(options.dir)]
+    folders = list(find_folders(options.dir).values())
     # Spawned: a forked process would inherit torch's threads in the middle of what they do.
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         verdicts = list(track(pool.map(examine, folders), "objects", len(folders)))

@@ -18,6 +18,14 @@ from fb3d_rl.assets.procedural import generate
 from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
 
 
+@pytest.fixture(scope="session", autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache of parsed objects of the tests' own, also for the commands that they run."""
+    folder = tmp_path_factory.mktemp("cache")
+    os.environ["FB3D_CACHE"] = str(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def procedural_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with one procedural cabinet, microwave and pot."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -11,7 +10,8 @@ from pathlib import Path
 
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.partnet_mobility import URDF, find_ids, load_object, load_objects
+from fb3d_rl.assets.folders import find_folders, find_split_file
+from fb3d_rl.assets.partnet_mobility import load_object, load_objects, read_category
 from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.contract import UserError
 
@@ -82,23 +82,23 @@ def partnet_catalog(
     """The objects below a PartNet-Mobility root that ``split`` selects; broken ones are left out and named.
 
     Args:
-        root: folder that holds ``<id>/mobility.urdf``.
+        root: see :mod:`fb3d_rl.assets.folders`.
         split: see :func:`fb3d_rl.assets.splits.select_ids`.
-        split_file: a file in UMPNet's format; UMPNet's own lists unless given.
+        split_file: a file in UMPNet's format; unless given, the one that lies in the root, else UMPNet's own lists.
 
     Raises:
         UserError: no such root, no object in it, an unknown split, or no usable object left.
     """
     if not root:
         raise UserError("assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR")
-    ids = find_ids(root)
-    table = read_split(split_file or UMPNET_SPLIT)
-    categories = {name: _category(Path(root) / name) for name in ids}
+    folders = find_folders(root)
+    table = read_split(split_file or find_split_file(root) or UMPNET_SPLIT)
+    categories = {name: _category(folder) for name, folder in folders.items()}
     chosen = select_ids(categories, split, table)
-    objects, skipped = load_objects(root, chosen)
+    objects, skipped = load_objects([folders[name] for name in chosen])
     for item in skipped:
         log.warning("skipped: %s", item.reason)
-    return [Entry(Path(root) / obj.id, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
+    return [Entry(obj.urdf.parent, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
 
 
 def find_objects(
@@ -119,14 +119,12 @@ def find_objects(
             names = procedural.generate(Path(folder), ("StorageFurniture", "Microwave", "KitchenPot"), 1, seed=0)
             return [load_object(Path(folder) / name) for name in names]
     if isinstance(objects, (str, Path)):
-        if (Path(objects) / URDF).is_file():
-            return [load_object(objects)]
         return [entry.load() for entry in partnet_catalog(str(objects), split)]
     return list(objects)
 
 
 def _category(folder: Path) -> str:
     try:
-        return str(json.loads((folder / "meta.json").read_text(encoding="utf-8"))["model_cat"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return read_category(folder)
+    except (OSError, UserError):
         return "unknown"  # load_object says what is wrong with a broken file

@@ -1,14 +1,15 @@
 """Read PartNet-Mobility folders: ``mobility.urdf``, ``semantics.txt``, ``meta.json`` and ``textured_objs/*.obj``.
 
 The objects come from strangers, so nothing in them is trusted: XML entities are refused, mesh paths may not leave
-the folder, and every flaw ends in one clear sentence (:class:`fb3d_rl.contract.UserError`).
+the folder, sizes are bounded, and every flaw ends in one clear sentence (:class:`fb3d_rl.contract.UserError`).
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
+import struct
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -18,16 +19,37 @@ import numpy as np
 import trimesh
 from defusedxml import DefusedXmlException, ElementTree
 from numpy.typing import NDArray
+from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Link, Mesh
+from fb3d_rl.assets.cache import Parsed, cached
+from fb3d_rl.assets.folders import URDFS, find_urdf
+from fb3d_rl.assets.splits import CATEGORIES
 from fb3d_rl.contract import UserError
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-URDF = "mobility.urdf"
 JOINT_TYPES: tuple[JointType, ...] = ("revolute", "continuous", "prismatic", "fixed")
+MESHES = (".obj", ".stl")
+
+LARGEST_TEXT = 16 * 2**20
+"""Most bytes of a URDF and of the files beside it."""
+
+LARGEST_OBJECT = 2**30
+"""Most bytes of an object's meshes together."""
+
+MOST_LINKS = 1000
+
+DECOMPOSED = "mobility_cvx.urdf"
+"""ManiSkill's URDF whose collision files hold several convex pieces each."""
+
+BROKEN = (ValueError, LookupError, AttributeError, TypeError, ArithmeticError, MemoryError, struct.error)
+"""What a mesh that is none makes its parser raise."""
+
+FARTHEST = 1e4
+"""Largest coordinate, m, and largest joint limit, m or rad, that is believed."""
 
 
 def load_object(folder: str | Path) -> ArticulatedObject:
@@ -40,40 +62,100 @@ def load_object(folder: str | Path) -> ArticulatedObject:
         UserError: the folder, the URDF or a mesh is missing or broken; the message names it.
     """
     folder = Path(folder)
-    urdf = folder / URDF
-    if not urdf.is_file():
-        raise UserError(f"object {folder.name}: {urdf} does not exist, so the folder is no PartNet-Mobility object")
+    urdf = find_urdf(folder)
+    if urdf is None:
+        raise UserError(
+            f"object {folder.name}: {folder / URDFS[-1]} does not exist, so the folder is no PartNet-Mobility object"
+        )
     try:
-        robot = _parse(urdf)
-        return _Reader(folder).read(robot)
+        category = read_category(folder)
+        links, dropped = cached(folder, _sources(folder, urdf), _Reader(folder, urdf).read)
+        return ArticulatedObject(folder.name, category, urdf, links, dropped)
     except (ParseError, DefusedXmlException) as error:
         raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
     except OSError as error:
         raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
 
 
-def _parse(urdf: Path) -> Element:
+def read_category(folder: Path) -> str:
+    """Category of an object: from its meta.json, else the name of the folder above, as in UMPNet's archive.
+
+    Raises:
+        UserError: meta.json is broken.
+    """
+    path = folder / "meta.json"
+    if not path.is_file():
+        return folder.parent.name if folder.parent.name in CATEGORIES else "unknown"
+    _bound(folder, path)
     try:
-        return ElementTree.fromstring(urdf.read_bytes())
-    except (LookupError, ValueError) as error:  # the XML declaration names an encoding that Python's parser lacks
-        raise ParseError(str(error)) from error
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"object {folder.name}: {path} is no valid JSON ({error})") from error
+    return str(meta.get("model_cat", "unknown")) if isinstance(meta, dict) else "unknown"
+
+
+def _sources(folder: Path, urdf: Path) -> list[Path]:
+    """All that an object is read from, which is not too much."""
+    texts = [path for path in (urdf, folder / "semantics.txt") if path.is_file()]
+    _bound(folder, *texts)
+    inside = folder.resolve()
+    meshes = sorted(
+        path
+        for path in folder.rglob("*")
+        if path.suffix.lower() in MESHES and path.is_file()
+        # The reader refuses a link out of the folder; what it leads to is not to be looked at before.
+        and (not path.is_symlink() or path.resolve().is_relative_to(inside))
+    )
+    size = sum(path.stat().st_size for path in meshes)
+    if size > LARGEST_OBJECT:
+        raise UserError(
+            f"object {folder.name}: its meshes have {size / 2**20:.0f} MiB, more than the {LARGEST_OBJECT / 2**20:.0f} "
+            "that are read; simplify them or remove the object"
+        )
+    return texts + meshes
+
+
+def _bound(folder: Path, *texts: Path) -> None:
+    for path in texts:
+        if path.stat().st_size > LARGEST_TEXT:
+            raise UserError(
+                f"object {folder.name}: {path} is larger than the {LARGEST_TEXT / 2**20:.0f} MiB that are read; "
+                "restore the file or remove the object"
+            )
 
 
 class _Reader:
-    """Reads the parts of one URDF; holds the folder and its mesh cache (visuals and collisions share files)."""
+    """Reads the parts of one URDF; holds the meshes read so far, since visuals and collisions share them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, urdf: Path) -> None:
         self.folder = folder
-        self.meshes: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        self.urdf = urdf
+        self.files: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        self.placed: dict[tuple[str, bytes, bytes], Mesh] = {}
         self.dropped: list[str] = []
 
-    def read(self, robot: Element) -> ArticulatedObject:
+    def parse(self) -> Element:
+        try:
+            return ElementTree.fromstring(self.urdf.read_bytes())
+        except (LookupError, ValueError) as error:  # the XML declaration names an encoding that Python's parser lacks
+            raise ParseError(str(error)) from error
+
+    def read(self) -> Parsed:
+        """The links, parents first, and what was left out.
+
+        Raises:
+            UserError: something is missing or broken.
+            ParseError, DefusedXmlException: the URDF is no well-formed XML or holds entities.
+        """
+        robot = self.parse()
         elements: dict[str, Element] = {}
         for element in robot.findall("link"):
             name = self.attribute(element, "name")
             if name in elements:
                 self.fail(f"two links are called {name!r}")
             elements[name] = element
+        if len(elements) > MOST_LINKS:
+            self.fail(f"{len(elements)} links are more than the {MOST_LINKS} that are read")
         joints: dict[str, tuple[str, Joint]] = {}
         for element in robot.findall("joint"):
             parent, child, joint = self.joint(element)
@@ -96,16 +178,10 @@ class _Reader:
                     collisions=self.shapes(elements[name], "collision"),
                 )
             )
-        return ArticulatedObject(
-            id=self.folder.name,
-            category=self.category(),
-            urdf=self.folder / URDF,
-            links=tuple(links),
-            dropped=tuple(dict.fromkeys(self.dropped)),
-        )
+        return tuple(links), tuple(dict.fromkeys(self.dropped))
 
     def fail(self, what: str) -> NoReturn:
-        raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.folder / URDF}")
+        raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.urdf}")
 
     def attribute(self, element: Element, name: str) -> str:
         value = element.get(name)
@@ -132,6 +208,8 @@ class _Reader:
         if origin is not None:
             transform[:3, 3] = self.numbers(origin.get("xyz"), 3, 0.0)
             transform[:3, :3] = Rotation.from_euler("xyz", self.numbers(origin.get("rpy"), 3, 0.0)).as_matrix()
+            if abs(transform).max() > FARTHEST:
+                self.fail(f"an origin lies {abs(transform).max():.3g} m away")
         return transform
 
     def joint(self, element: Element) -> tuple[str, str, Joint]:
@@ -171,6 +249,8 @@ class _Reader:
         if lower > upper:
             self.dropped.append(f"limits of joint {name}: lower above upper, swapped")
             lower, upper = upper, lower
+        if max(abs(lower), abs(upper)) > FARTHEST:
+            return (-math.inf, math.inf)
         return (lower, upper)
 
     def parents_first(self, links: Iterable[str], joints: dict[str, tuple[str, Joint]]) -> list[str]:
@@ -197,30 +277,45 @@ class _Reader:
                 self.dropped.append(f"a {tag} of {link.get('name')}: no mesh")
                 continue
             filename = self.attribute(mesh, "filename")
-            vertices, faces = self.mesh(filename)
-            scale = self.numbers(mesh.get("scale"), 3, 1.0)
-            transform = self.origin(element)
-            if len(faces) == 0:
-                continue
-            moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
-            meshes.append(Mesh(moved, faces))
+            placed = self.place(filename, self.numbers(mesh.get("scale"), 3, 1.0), self.origin(element))
+            if tag == "collision" and self.urdf.name == DECOMPOSED:
+                meshes += self.pieces(placed)
+            elif len(placed.faces):
+                meshes.append(placed)
         return tuple(meshes)
+
+    def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64]) -> Mesh:
+        """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments."""
+        key = (filename, scale.tobytes(), transform.tobytes())
+        if key not in self.placed:
+            vertices, faces = self.mesh(filename)
+            with np.errstate(over="ignore", invalid="ignore"):
+                moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
+            if len(faces) and not abs(moved).max() <= FARTHEST:
+                self.fail(f"the mesh {filename} reaches {abs(moved).max():.3g} m from its link")
+            self.placed[key] = Mesh(moved, faces)
+        return self.placed[key]
+
+    def pieces(self, mesh: Mesh) -> list[Mesh]:
+        """The convex pieces of a link that were written as one file."""
+        bodies = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
+        return [Mesh(np.asarray(body.vertices), np.asarray(body.faces)) for body in bodies]
 
     def mesh(self, filename: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         path = (self.folder / filename).resolve()
-        if path in self.meshes:
-            return self.meshes[path]
+        if path in self.files:
+            return self.files[path]
         if not path.is_relative_to(self.folder.resolve()):
             self.fail(f"the mesh path {filename!r} leaves the object's folder")
-        if path.suffix.lower() != ".obj":
-            self.fail(f"the mesh {filename} is no .obj file")
+        if path.suffix.lower() not in MESHES:
+            self.fail(f"the mesh {filename} is no {' or '.join(MESHES)} file")
         if not path.is_file():
             self.fail(f"the mesh {filename} is missing")
         try:
             loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
             vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
             faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-        except (ValueError, IndexError, KeyError, AttributeError, TypeError) as error:
+        except BROKEN as error:
             raise UserError(f"object {self.folder.name}: the mesh {filename} is broken ({error})") from error
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all()):
             self.fail(f"the mesh {filename} has vertices that are missing or no numbers")
@@ -229,8 +324,8 @@ class _Reader:
         if not area > 0:
             self.dropped.append(f"{filename}: no surface")
             faces = faces[:0]
-        self.meshes[path] = (vertices, faces)
-        return self.meshes[path]
+        self.files[path] = (vertices, faces)
+        return self.files[path]
 
     def semantics(self) -> dict[str, str]:
         """Link name -> semantic name, of lines such as ``link_0 hinge door``; a missing file names nothing."""
@@ -241,16 +336,6 @@ class _Reader:
         lines = (line.split() for line in path.read_text(encoding="utf-8", errors="replace").splitlines())
         return {words[0]: words[2] for words in lines if len(words) >= 3}
 
-    def category(self) -> str:
-        path = self.folder / "meta.json"
-        if not path.is_file():
-            return "unknown"
-        try:
-            meta = json.loads(path.read_text(encoding="utf-8"))
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"object {self.folder.name}: {path} is no valid JSON ({error})") from error
-        return str(meta.get("model_cat", "unknown")) if isinstance(meta, dict) else "unknown"
-
 
 @dataclass(frozen=True)
 class Skipped:
@@ -260,35 +345,20 @@ class Skipped:
     reason: str
 
 
-def load_objects(root: str | Path, ids: Iterable[str]) -> tuple[list[ArticulatedObject], list[Skipped]]:
-    """Read the objects ``ids`` below ``root``; broken ones are skipped and named.
+def load_objects(folders: Collection[Path]) -> tuple[list[ArticulatedObject], list[Skipped]]:
+    """Read objects; broken ones are skipped and named.
 
     Raises:
         UserError: not one object is left.
     """
     objects: list[ArticulatedObject] = []
     skipped: list[Skipped] = []
-    for name in ids:
+    for folder in track(folders, "objects", transient=True):
         try:
-            objects.append(load_object(Path(root) / name))
+            objects.append(load_object(folder))
         except UserError as error:
-            skipped.append(Skipped(name, str(error)))
+            skipped.append(Skipped(folder.name, str(error)))
     if not objects:
         first = f"; the first: {skipped[0].reason}" if skipped else ""
-        raise UserError(f"no object of {root} can be used ({len(skipped)} are broken{first})")
+        raise UserError(f"no object can be used ({len(skipped)} are broken{first})")
     return objects, skipped
-
-
-def find_ids(root: str | Path) -> list[str]:
-    """Ids of the object folders directly below ``root``, sorted.
-
-    Raises:
-        UserError: ``root`` does not exist or holds no object.
-    """
-    root = Path(root)
-    if not root.is_dir():
-        raise UserError(f"assets.root: {root} is no folder; give the folder that holds <id>/{URDF}")
-    ids = sorted(path.parent.name for path in root.glob(f"*/{URDF}"))
-    if not ids:
-        raise UserError(f"assets.root: {root} holds no object; expected <id>/{URDF} below it")
-    return ids

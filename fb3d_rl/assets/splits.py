@@ -22,7 +22,15 @@ TRAIN_CATEGORIES = (
     "Toilet", "TrashCan", "Window",
 )  # fmt: skip
 
+TEST_CATEGORIES = (
+    "Box", "Bucket", "Dishwasher", "Door", "KitchenPot", "Oven", "Phone", "Safe", "Table", "WashingMachine",
+)  # fmt: skip
+
+CATEGORIES = TRAIN_CATEGORIES + TEST_CATEGORIES
+
 HELD_OUT_SHARE = 0.2
+
+WORD_FILES = (".txt", ".json")
 
 
 def read_split(path: str | Path = UMPNET_SPLIT) -> dict[str, str]:
@@ -63,7 +71,8 @@ def select_ids(
 
     Args:
         categories: object id -> category of all objects there are.
-        split: "all", a split's name, a category or an object id; or several of them, in a list or with commas.
+        split: "all", a split's name, a category, an object id, or a file of such words (one to a line in .txt, a list
+            in .json); or several of them, in a list or with commas.
         table: object id -> split, from :func:`read_split`.
 
     Raises:
@@ -71,8 +80,9 @@ def select_ids(
     """
     known_categories = set(categories.values())
     chosen: set[str] = set()
-    words = str(split).split(",") if isinstance(split, (str, int)) else [str(word) for word in split]
-    for word in filter(None, map(str.strip, words)):
+    given = str(split).split(",") if isinstance(split, (str, int)) else [str(word) for word in split]
+    words = [word for name in filter(None, map(str.strip, given)) for word in _words(name)]
+    for word in words:
         name = word.replace("-", "_")
         if word == "all":
             chosen.update(categories)
@@ -89,3 +99,25 @@ def select_ids(
     if not chosen:
         raise UserError(f"assets.split: no object of this root belongs to {split!r}")
     return sorted(chosen)
+
+
+def _words(name: str) -> list[str]:
+    """The word itself, or those in the file of this name.
+
+    Raises:
+        UserError: the file is missing or holds no list of words.
+    """
+    path = Path(name)
+    if path.suffix not in WORD_FILES:
+        return [name]
+    try:
+        text = path.read_text(encoding="utf-8")
+        words = json.loads(text) if path.suffix == ".json" else text.split()
+        if not isinstance(words, list) or not all(isinstance(word, (str, int)) for word in words):
+            raise ValueError("it is no list of words")
+    except (OSError, ValueError, RecursionError) as error:
+        raise UserError(
+            f"assets.split: {name} cannot be read as a list of splits, categories or ids ({error}); "
+            "a file in UMPNet's format goes to assets.split_file"
+        ) from error
+    return [str(word) for word in words]

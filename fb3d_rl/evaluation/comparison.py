@@ -30,9 +30,10 @@ from rich.console import Console
 from rich.table import Table
 
 from fb3d_rl.evaluation import learning, tables
-from fb3d_rl.evaluation.rows import TrialRow, policies, write_text
+from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import Run, labels
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, SUCCESS, TRIAL, Means, Metric
+from fb3d_rl.files import write_text
 
 METHOD = (
     ("Interval", f"95 %: objects are resampled (bootstrap, {tables.RESAMPLES} times) and all trials of an object, over "

@@ -23,10 +23,11 @@ from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
 from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_text, write_trials
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
 from fb3d_rl.evaluation.tables import show, summary
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.evaluation.video import film_trials
+from fb3d_rl.files import write_text
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 

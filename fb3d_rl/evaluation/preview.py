@@ -17,8 +17,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.shade import Body, Camera, Part, Studio, link_colors, srgb
 from fb3d_rl.camera.views import View
 from fb3d_rl.evaluation import page
-from fb3d_rl.evaluation.rows import write_bytes
 from fb3d_rl.evaluation.video import FAINT, INK, arrow_mesh, font
+from fb3d_rl.files import write_bytes
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
 

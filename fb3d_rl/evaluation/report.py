@@ -16,9 +16,10 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation import comparison, curves, page, tables
 from fb3d_rl.evaluation.comparison import Comparison, Group
 from fb3d_rl.evaluation.page import text
-from fb3d_rl.evaluation.rows import TrialRow, policies, write_text
+from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import CLOUD_ARRAYS, read_run
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, MOTION_ONLY, SUCCESS, Metric
+from fb3d_rl.files import write_text
 
 READING = (
     ("Flow", "direction and relative size of each visible point's motion when the part opens a little; the "

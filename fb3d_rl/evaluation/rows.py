@@ -8,13 +8,13 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.files import write_text
 
 
 @dataclass(frozen=True)
@@ -106,19 +106,6 @@ class FlowRow:
 Row = TypeVar("Row", TrialRow, FlowRow)
 
 _BOOLEANS = {"True": True, "False": False}
-
-
-def write_text(path: Path, text: str) -> None:
-    """Replace ``path`` by ``text`` (UTF-8) in one step: readers see the old or the new file, never half."""
-    # surrogateescape: error texts may quote file names whose bytes are not valid UTF-8.
-    write_bytes(path, text.encode("utf-8", "surrogateescape"))
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """The same for ``content`` as it is."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_bytes(content)
-    os.replace(beside, path)
 
 
 def _write(path: Path, rows: Sequence[Row], kind: type[Row]) -> None:

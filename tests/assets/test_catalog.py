@@ -122,10 +122,10 @@ def test_what_cannot_be_used_is_refused(root: Path, tmp_path: Path) -> None:
 
 
 def test_real_splits_hold_the_listed_objects(real_root: Path) -> None:
-    from fb3d_rl.assets.partnet_mobility import find_ids
+    from fb3d_rl.assets.folders import find_folders
     from fb3d_rl.assets.splits import read_split
 
-    table, ids = read_split(), find_ids(real_root)
+    table, ids = read_split(), find_folders(real_root)
     chosen = [name for name in ids if name in table][:3]
     for entry in partnet_catalog(str(real_root), ",".join(chosen)):
         assert entry.split == table[entry.id]

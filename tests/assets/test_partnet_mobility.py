@@ -10,10 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
+from fb3d_rl.assets import partnet_mobility
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.partnet_mobility import find_ids, load_object, load_objects
+from fb3d_rl.assets.folders import find_folders
+from fb3d_rl.assets.partnet_mobility import load_object, load_objects
 from fb3d_rl.contract import UserError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 2 3\nf 1 3 4\n"
@@ -209,22 +212,69 @@ def test_load_objects_skips_and_names_broken_ones(tmp_path: Path) -> None:
     for name in ("good", "fine"):
         write(tmp_path / name)
     write(tmp_path / "bad", "<robot>")
-    objects, skipped = load_objects(tmp_path, ["good", "bad", "fine"])
+    objects, skipped = load_objects([tmp_path / name for name in ("good", "bad", "fine")])
     assert [obj.id for obj in objects] == ["good", "fine"]
     assert [item.id for item in skipped] == ["bad"] and "bad" in skipped[0].reason
     with pytest.raises(UserError, match="object bad"):
-        load_objects(tmp_path, ["bad"])
+        load_objects([tmp_path / "bad"])
 
 
-def test_find_ids(tmp_path: Path) -> None:
-    for name in ("b", "a"):
-        write(tmp_path / name)
-    (tmp_path / "no_object").mkdir()
-    assert find_ids(tmp_path) == ["a", "b"]
-    with pytest.raises(UserError, match=r"no folder"):
-        find_ids(tmp_path / "nowhere")
-    with pytest.raises(UserError, match=r"no object"):
-        find_ids(tmp_path / "no_object")
+def test_sizes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before a file is read: the limits are far above what real objects have."""
+    folder = write(tmp_path / "a17")
+    monkeypatch.setattr(partnet_mobility, "MOST_LINKS", 4)
+    assert "5 links" in refuse(write(folder, GOOD + " "))  # not yet in the cache
+    monkeypatch.undo()
+    size = (folder / "textured_objs/a.obj").stat().st_size
+    monkeypatch.setattr(partnet_mobility, "LARGEST_OBJECT", size)
+    load_object(folder)
+    monkeypatch.setattr(partnet_mobility, "LARGEST_OBJECT", size - 1)
+    assert "meshes" in refuse(folder)
+    monkeypatch.setattr(partnet_mobility, "LARGEST_TEXT", 20)
+    assert "larger" in refuse(folder)
+
+
+@pytest.mark.parametrize(
+    ("good", "bad", "word"),
+    [
+        ('xyz="1 2 3"', 'xyz="1 2 1e200"', "1e\\+200 m away"),
+        ('a.obj"/>', 'a.obj" scale="1 1 1e300"/>', "from its link"),
+    ],
+)
+def test_objects_beyond_measure_are_refused(tmp_path: Path, good: str, bad: str, word: str) -> None:
+    assert re.search(word, refuse(write(tmp_path / "a17", GOOD.replace(good, bad))))
+
+
+def test_limits_beyond_measure_are_none(tmp_path: Path) -> None:
+    obj = load_object(write(tmp_path / "a17", GOOD.replace('upper="1.25"', 'upper="1e300"')))
+    assert obj.joint_of(obj.index("door")).limits == (-math.inf, math.inf)
+
+
+def test_a_decomposed_part_collides_piece_by_piece(tmp_path: Path) -> None:
+    """ManiSkill's mobility_cvx.urdf goes before mobility.urdf; several convex pieces lie in one collision file."""
+    two = TRIANGLE + "v 5 0 0\nv 6 0 0\nv 5 2 0\nv 5 0 3\nf 5 6 7\nf 5 7 8\n"
+    folder = write(tmp_path / "a17", GOOD.replace('lower="-0.5"', 'lower="-0.25"'), two)
+    (folder / "mobility.urdf").rename(folder / "mobility_cvx.urdf")
+    write(folder, mesh=two)
+    obj = load_object(folder)
+    assert obj.urdf.name == "mobility_cvx.urdf"
+    door = obj.links[obj.index("door")]
+    assert obj.joint_of(obj.index("door")).limits == (-0.25, 1.25)
+    assert len(door.visuals) == 1 and len(door.collisions) == 2
+    assert sorted(len(mesh.vertices) for mesh in door.collisions) == [4, 4]
+    (folder / "mobility_cvx.urdf").unlink()
+    whole = load_object(folder)
+    assert len(whole.links[whole.index("door")].collisions) == 1
+
+
+def test_binary_meshes_are_read(tmp_path: Path) -> None:
+    folder = write(tmp_path / "a17", GOOD.replace("a.obj", "a.STL"))
+    trimesh.creation.box((1, 2, 3)).export(folder / "textured_objs/a.STL", file_type="stl")
+    (mesh,) = (obj := load_object(folder)).links[obj.index("door")].collisions
+    assert len(mesh.faces) == 12
+    (folder / "textured_objs/a.STL").write_bytes(b"solid\0" * 30)
+    empty = load_object(folder)
+    assert not any(link.visuals for link in empty.links) and "textured_objs/a.STL: no surface" in empty.dropped
 
 
 def mutated(rng: np.random.Generator) -> bytes:
@@ -245,7 +295,7 @@ def mutated(rng: np.random.Generator) -> bytes:
 def test_mutated_urdfs_end_in_an_object_or_a_sentence(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     outcomes: Counter[bool] = Counter()
-    for _ in range(200):
+    for _ in range(1000):
         folder = write(tmp_path / "a17", mutated(rng))
         try:
             obj = load_object(folder)
@@ -279,9 +329,9 @@ def test_mutated_meshes_end_in_an_object_or_a_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_every_real_object_loads_with_the_joints_of_its_file(real_root: Path) -> None:
-    ids = find_ids(real_root)
-    objects, skipped = load_objects(real_root, ids)
-    assert not skipped and [obj.id for obj in objects] == ids
+    folders = find_folders(real_root)
+    objects, skipped = load_objects(folders.values())
+    assert not skipped and [obj.id for obj in objects] == list(folders)
     for obj in objects:
         # Counted in the raw text, not by an XML parser.
         raw = Counter(re.findall(r'<joint\b[^>]*\btype="(\w+)"', obj.urdf.read_text(encoding="utf-8")))

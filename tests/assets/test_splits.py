@@ -7,7 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.assets.splits import SPLITS, TRAIN_CATEGORIES, UMPNET_SPLIT, read_split, select_ids, split_of
+from fb3d_rl.assets.splits import (
+    SPLITS,
+    TEST_CATEGORIES,
+    TRAIN_CATEGORIES,
+    UMPNET_SPLIT,
+    read_split,
+    select_ids,
+    split_of,
+)
 from fb3d_rl.contract import UserError
 
 CATEGORIES = {"1": "Laptop", "2": "Laptop", "3": "Oven", "4": "Table", "x-5": "Laptop"}
@@ -24,8 +32,7 @@ def test_umpnets_lists_are_read_whole() -> None:
         assert {table[str(i)] for i in parts["test"]} == {"test"}
     listed = sum(len(ids) for half in content.values() for parts in half.values() for ids in parts.values())
     assert len(table) == listed and set(table.values()) == set(SPLITS)
-    assert set(TRAIN_CATEGORIES) <= set(content["train"])
-    assert not set(TRAIN_CATEGORIES) & set(content["test"])
+    assert set(content["train"]) - set(TRAIN_CATEGORIES) == {"Toy"} and set(TEST_CATEGORIES) == set(content["test"])
 
 
 def test_the_table_goes_before_the_category() -> None:
@@ -61,6 +68,26 @@ def test_unlisted_objects_go_by_category_and_a_stable_share_is_held_out() -> Non
 def test_words_select(split: str | list[object], ids: list[str]) -> None:
     table = {**TABLE, "x-5": "train_train"}
     assert select_ids(CATEGORIES, split, table) == ids
+
+
+def test_files_of_words_select(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("4 Laptop\n  train-test\n")
+    (tmp_path / "mine.json").write_text('[3, "x-5"]')
+    text, table = str(tmp_path / "mine.txt"), str(tmp_path / "mine.json")
+    assert select_ids(CATEGORIES, text, TABLE) == ["1", "2", "4", "x-5"]
+    assert select_ids(CATEGORIES, [table, 1], TABLE) == ["1", "3", "x-5"]
+    (tmp_path / "mine.txt").write_text("4 nonsense")
+    with pytest.raises(UserError, match="nonsense"):
+        select_ids(CATEGORIES, text, TABLE)
+
+
+@pytest.mark.parametrize("content", [None, '{"train": {}}', "[[1]]", "[", "[" * 100_000])
+def test_broken_files_of_words_are_named(tmp_path: Path, content: str | None) -> None:
+    path = tmp_path / "mine.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(UserError, match=r"mine\.json cannot be read"):
+        select_ids(CATEGORIES, str(path), TABLE)
 
 
 @pytest.mark.parametrize("split", ["trian", "99", "all,Lapto", "Door"])

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.partnet_mobility import find_ids, load_object
+from fb3d_rl.assets.folders import find_folders
+from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
@@ -73,7 +74,7 @@ def test_procedural_objects(procedural_objects: dict[str, ArticulatedObject]) ->
 def test_real_objects_of_every_joint_type(real_root: Path) -> None:
     wanted = {"revolute", "prismatic", "continuous", "nested"}
     chosen: list[ArticulatedObject] = []
-    for name in find_ids(real_root):
+    for name in find_folders(real_root):
         text = (real_root / name / "mobility.urdf").read_text(encoding="utf-8")
         kinds = set(re.findall(r'<joint\b[^>]*\btype="(\w+)"', text))
         if not wanted or not (kinds | {"nested"}) & wanted:

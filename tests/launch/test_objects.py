@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from fb3d_rl.assets.partnet_mobility import find_ids, load_object
+from fb3d_rl.assets.folders import find_folders
+from fb3d_rl.assets.partnet_mobility import load_object
 from launch.objects import main
 
 
@@ -16,7 +17,7 @@ def test_objects_are_made_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixtur
     made = tmp_path / "made"
     assert main(["generate", "--out", str(made), "--categories", "Phone,Switch", "--count", "2", "--seed", "4"]) == 0
     assert "4 objects of 2 categories" in capsys.readouterr().out
-    objects = [load_object(made / name) for name in find_ids(made)]
+    objects = [load_object(made / name) for name in find_folders(made)]
     assert sorted(obj.category for obj in objects) == ["Phone", "Phone", "Switch", "Switch"]
 
     sheet = tmp_path / "below" / "sheet.png"
@@ -39,7 +40,7 @@ def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str
 @pytest.mark.parametrize(("word", "count", "without"), [("all", 21, ""), ("train", 11, "Box"), ("test", 10, "Laptop")])
 def test_categories_by_split(tmp_path: Path, word: str, count: int, without: str) -> None:
     assert main(["generate", "--out", str(tmp_path), "--categories", word, "--count", "1"]) == 0
-    categories = {name.split("-")[1] for name in find_ids(tmp_path)}
+    categories = {name.split("-")[1] for name in find_folders(tmp_path)}
     assert len(categories) == count and without not in categories
 
 

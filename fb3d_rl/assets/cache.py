@@ -1,0 +1,131 @@
+"""Objects that were read before, kept on disk by the content of the files that they were read from.
+
+Parsing the text of an object's meshes takes fifty times as long as reading its entry here. An entry begins with the
+digest of all that follows; one that does not match, or is of another version, counts as not there. The folder may be
+deleted at any time.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+import trimesh
+
+from fb3d_rl.assets.articulation import Joint, Link, Mesh
+from fb3d_rl.files import write_bytes
+
+VERSION = 1
+"""Of what is kept and of the reader that makes it; raise it with either."""
+
+DIGEST = hashlib.sha256().digest_size
+
+Parsed = tuple[tuple[Link, ...], tuple[str, ...]]
+"""An object's links and what was left out of it."""
+
+
+def cache_folder() -> Path:
+    """Where entries lie: ``FB3D_CACHE``, or the user's cache folder of this platform."""
+    chosen = os.environ.get("FB3D_CACHE")
+    return Path(chosen) if chosen else platformdirs.user_cache_path("fb3d_rl")
+
+
+def cached(folder: Path, files: Iterable[Path], read: Callable[[], Parsed]) -> Parsed:
+    """What ``read`` returned when a folder's ``files`` had the content that they have now; it is called if need be.
+
+    Where entries cannot be written, objects are read anew each time.
+    """
+    key = hashlib.sha256(f"{VERSION} {trimesh.__version__}".encode())
+    for file in files:
+        content = file.read_bytes()
+        key.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
+        key.update(content)
+    entry = cache_folder() / f"objects/{key.hexdigest()}"
+    with suppress(OSError):
+        stored = memoryview(entry.read_bytes())
+        if hashlib.sha256(stored[DIGEST:]).digest() == stored[:DIGEST]:
+            return _unpack(stored[DIGEST:])
+    parsed = read()
+    with suppress(OSError):
+        entry.parent.mkdir(parents=True, exist_ok=True)
+        payload = _pack(parsed)
+        write_bytes(entry, hashlib.sha256(payload).digest(), payload)
+    return parsed
+
+
+def _pack(parsed: Parsed) -> memoryview:
+    """A table in JSON, then the vertices [V, 3] and faces [F, 3] of all meshes, each mesh once."""
+    links, dropped = parsed
+    meshes = {id(mesh): mesh for link in links for mesh in (*link.visuals, *link.collisions)}
+    number = {key: k for k, key in enumerate(meshes)}
+
+    def joint(link: Link) -> object:
+        return link.joint and {**asdict(link.joint), "origin": link.joint.origin.tolist(), "axis": [*link.joint.axis]}
+
+    table = {
+        "links": [
+            {
+                "name": link.name,
+                "semantic": link.semantic,
+                "parent": link.parent,
+                "joint": joint(link),
+                "visuals": [number[id(mesh)] for mesh in link.visuals],
+                "collisions": [number[id(mesh)] for mesh in link.collisions],
+            }
+            for link in links
+        ],
+        "dropped": dropped,
+        "meshes": [(len(mesh.vertices), len(mesh.faces)) for mesh in meshes.values()],
+    }
+    out = io.BytesIO()
+    nothing = np.zeros((0, 3))
+    for array in (
+        np.frombuffer(json.dumps(table).encode(), dtype=np.uint8),
+        np.concatenate([nothing, *(mesh.vertices for mesh in meshes.values())]),
+        np.concatenate([nothing, *(mesh.faces for mesh in meshes.values())]).astype(np.int32),
+    ):
+        np.save(out, array, allow_pickle=False)
+    return out.getbuffer()
+
+
+def _unpack(payload: memoryview) -> Parsed:
+    stream = io.BytesIO(payload)
+    text, vertices, faces = (np.load(stream, allow_pickle=False) for _ in range(3))
+    table = json.loads(text.tobytes())
+    counts = np.array(table["meshes"], dtype=np.int64).reshape(-1, 2)
+    ends = counts.cumsum(0)[:-1]
+    meshes = [
+        Mesh(corners, triangles)
+        for corners, triangles in zip(
+            np.split(vertices, ends[:, 0]), np.split(faces.astype(np.int64), ends[:, 1]), strict=True
+        )
+    ]
+
+    def joint(entry: dict[str, Any] | None) -> Joint | None:
+        if entry is None:
+            return None
+        arrays = {key: np.array(entry[key], dtype=np.float64) for key in ("origin", "axis")}
+        lower, upper = entry["limits"]
+        return Joint(**{**entry, **arrays, "limits": (lower, upper)})
+
+    links = tuple(
+        Link(
+            **{
+                **entry,
+                "joint": joint(entry["joint"]),
+                "visuals": tuple(meshes[k] for k in entry["visuals"]),
+                "collisions": tuple(meshes[k] for k in entry["collisions"]),
+            }
+        )
+        for entry in table["links"]
+    )
+    return links, tuple(table["dropped"])
