@@ -102,7 +102,8 @@ def _sources(folder: Path, urdf: Path) -> list[Path]:
     meshes = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in MESHES and path.is_file()
+        if path.suffix.lower() in MESHES
+        and path.is_file()
         # The reader refuses a link out of the folder; what it leads to is not to be looked at before.
         and (not path.is_symlink() or path.resolve().is_relative_to(inside))
     )

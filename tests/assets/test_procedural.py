@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import json
+import tempfile
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural import FAMILIES, generate, sample
+from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.assets.procedural import FAMILIES, generate, object_id, sample
+from fb3d_rl.assets.procedural.spec import write_object
 from fb3d_rl.contract import UserError
+from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
+from fb3d_rl.flow.kinematics import KinematicTree
 
 PER_FAMILY = 6
 SEED = 3
@@ -164,7 +172,7 @@ def test_files(objects: list[tuple[Path, Link, list[Link]]]) -> None:
 
 def test_joints_open_outwards(objects: list[tuple[Path, Link, list[Link]]]) -> None:
     for path, _, movable in objects:
-        assert 1 <= len(movable) <= 6
+        assert 1 <= len(movable) <= 8
         for link in movable:
             low, high = link.limits
             kind, name = link.semantic.split(" ")
@@ -247,6 +255,53 @@ def test_parts_touch_nothing_while_they_move(objects: list[tuple[Path, Link, lis
                     near = ((moved[0].min(0) < high + GAP) & (moved[0].max(0) > low - GAP)).all(1)
                     for k in np.flatnonzero(near):
                         assert separation(moved, others[k]) > GAP, (path.name, link.semantic, share)
+
+
+def test_flow_is_nonzero_exactly_on_what_moves(objects: list[tuple[Path, Link, list[Link]]]) -> None:
+    for path, _, _ in objects:
+        obj = load_object(path)
+        tree = KinematicTree.from_object(obj)
+        poses = tree.forward(torch.as_tensor(obj.limits.mean(1)))
+        meshes = [(i, mesh.vertices) for i, link in enumerate(obj.links) for mesh in link.visuals]
+        points = np.concatenate([v @ poses[i, :3, :3].numpy().T + poses[i, :3, 3].numpy() for i, v in meshes])
+        links = np.concatenate([np.full(len(v), i) for i, v in meshes])
+        for k, target in enumerate(obj.movable):
+            direction = torch.eye(len(obj.movable))[k]
+            flow = articulation_flow(tree, torch.as_tensor(points), torch.as_tensor(links), poses, direction)
+            length = flow.norm(dim=-1).numpy()
+            moves = np.isin(links, obj.descendants(target))
+            assert (length[~moves] == 0).all(), path.name
+            joint, frame = obj.joint_of(target), poses[target].numpy()
+            arms = np.cross(frame[:3, :3] @ joint.axis, points - frame[:3, 3])
+            expected = np.linalg.norm(arms, axis=-1) if joint.type == "revolute" else 1.0
+            np.testing.assert_allclose(length[moves], (STEP * expected * np.ones(len(points)))[moves], rtol=1e-4, atol=1e-12)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@given(st.sampled_from(list(FAMILIES)), st.integers(0, 2**31), st.integers(0, 9999))
+def test_what_holds_for_these_holds_for_any_seed(category: str, seed: int, index: int) -> None:
+    any_seed(category, seed, index)
+
+
+@pytest.mark.slow
+@settings(max_examples=600, deadline=None, derandomize=True, database=None)
+@given(st.sampled_from(list(FAMILIES)), st.integers(0, 2**31), st.integers(0, 9999))
+def test_what_holds_for_these_holds_for_many_seeds(category: str, seed: int, index: int) -> None:
+    any_seed(category, seed, index)
+
+
+def any_seed(category: str, seed: int, index: int) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / object_id(category, seed, index)
+        path.mkdir()
+        write_object(sample(category, seed, index), path, path.name)
+        objects = [(path, *read(path))]
+        test_files(objects)
+        test_joints_open_outwards(objects)
+        test_pieces_are_convex_and_watertight(objects)
+        test_bodies_are_hollow(objects)
+        test_parts_touch_nothing_while_they_move(objects)
+        test_flow_is_nonzero_exactly_on_what_moves(objects)
 
 
 def test_simulator_loads_them(folder: Path) -> None:

@@ -46,6 +46,13 @@ FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
 }
 
 
+SKEWED = 0.15
+"""Share of objects whose axes do not run along the coordinate axes."""
+
+SKEW = 0.02
+"""By how much at most, rad: a degree, as the most tilted joint among 175 of real objects."""
+
+
 def object_id(category: str, seed: int, index: int) -> str:
     """The id, and folder name, of one procedural object."""
     return f"proc-{category}-{seed}-{index:04d}"
@@ -59,7 +66,10 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     """
     check([category], 1, seed)
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
-    return FAMILIES[category](rng).normalised()
+    spec = FAMILIES[category](rng)
+    if rng.random() < SKEWED:
+        spec = spec.turned(rng.uniform(-SKEW, SKEW))
+    return spec.normalised()
 
 
 def check(categories: Sequence[str], count: int, seed: int) -> None:

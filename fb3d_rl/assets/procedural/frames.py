@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fb3d_rl.assets.procedural.fronts import (
     FrontStyle,
     Side,
     draw_handle,
-    handle,
     hinged_door,
     panel,
     swing_room,
@@ -44,6 +45,7 @@ def door(rng: np.random.Generator) -> ObjectSpec:
         thickness,
         rng.uniform(0.05, 0.1) * rng.integers(0, 2),
         rng.uniform(0.2, 0.45),
+        rng.random(),
     )
     inner = x[1] - x[0] - 2 * bar
     gap = rng.uniform(0.0045, 0.006) + swing_room(inner / (2 if double else 1), thickness)
@@ -69,7 +71,7 @@ def window(rng: np.random.Generator) -> ObjectSpec:
     bar, sheet, clearance = rng.uniform(0.04, 0.08), rng.uniform(0.03, 0.05), rng.uniform(0.0045, 0.006)
     deep = 2 * sheet + 2 * clearance
     body = frame("window_frame", x, y, (-deep, 0.0), bar, sill=True)
-    style = FrontStyle(draw_handle(rng, bare=0.1), sheet, rng.uniform(0.04, 0.08), rng.uniform(0.2, 0.45))
+    style = FrontStyle(draw_handle(rng, bare=0.1), sheet, rng.uniform(0.04, 0.08), rng.uniform(0.2, 0.45), rng.random())
     if rng.random() < 0.4:
         gap = clearance + swing_room((x[1] - x[0]) / 2 - bar, sheet)
         pane_y = (y[0] + bar + gap, y[1] - bar - gap)
@@ -96,11 +98,10 @@ def window(rng: np.random.Generator) -> ObjectSpec:
         else [(right, tracks[0], -1.0), (left, tracks[1], 1.0)]
     )
     movable = 2 if rng.random() < 0.4 else 1
+    looks = (style, replace(style, handle=replace(style.handle, kind="none")))  # no room before the rear pane
     parts = []
     for k, (pane_x, pane_z, way) in enumerate(panes):
-        pane = panel("window_pane", style, pane_x, pane_y, pane_z)
-        if k == 0:  # only the front pane has room for a handle before it
-            pane += handle(style.handle, pane_x, pane_y, pane_z, "left" if way > 0 else "right")
+        pane = panel("window_pane", looks[k], pane_x, pane_y, pane_z, "left" if way > 0 else "right")
         if k < movable:
             travel = (pane_x[1] - pane_x[0] - lap) * rng.uniform(0.6, 0.9)
             parts.append(Part("translation_window", "slider", (way, 0, 0), travel, tuple(pane)))

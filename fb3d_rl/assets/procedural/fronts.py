@@ -21,21 +21,26 @@ HINGE_AXIS: dict[Side, Vector] = {
 }
 
 
+BEHIND = 0.0015
+"""How far (m) a door may swing behind its closed back face."""
+
+
 @dataclass(frozen=True)
 class HandleStyle:
     """How an object's handles look; lengths in metres.
 
     Attributes:
-        kind: "bar" on two posts, "knob", "lip" along the panel's free edge, or "none".
+        kind: "bar" on two posts, "knob", "lip" along the panel's free edge, "recessed" (a grip hollowed out of the
+            panel), or "none".
         reach: How far the handle stands out of the panel.
-        thickness: Of the bar or lip; a knob is twice as wide.
-        length: Of the bar or lip, as a fraction of the panel's side that it runs along.
+        thickness: Of the bar or lip; a knob is twice as wide, a recessed grip four times.
+        length: Of the bar, lip or grip, as a fraction of the panel's side that it runs along.
         inset: Distance of the handle's middle from the panel's free edge.
         shift: Where along the free edge the handle sits, from -1 to 1.
         round: Whether bars are rods rather than square.
     """
 
-    kind: Literal["bar", "knob", "lip", "none"]
+    kind: Literal["bar", "knob", "lip", "recessed", "none"]
     reach: float
     thickness: float
     length: float
@@ -53,18 +58,21 @@ class FrontStyle:
         thickness: Panel thickness, m.
         rail: Width of the frame around a recessed field, m; 0 for a flat panel.
         recess: How deep the field lies, as a fraction of the thickness, below 0.5 where handles are rooted.
+        setback: How far a hinge's axis lies inside the door's edge, as a fraction of what is possible.
     """
 
     handle: HandleStyle
     thickness: float
     rail: float
     recess: float
+    setback: float = 0.0
 
 
 def draw_handle(rng: np.random.Generator, bare: float = 0.12) -> HandleStyle:
     """A random handle style; with probability `bare` there is no handle."""
     rest = 1 - bare
-    kind = rng.choice(["bar", "knob", "lip", "none"], p=[0.55 * rest, 0.3 * rest, 0.15 * rest, bare])
+    kinds, shares = ["bar", "knob", "lip", "recessed"], np.array([0.5, 0.25, 0.13, 0.12])
+    kind = rng.choice([*kinds, "none"], p=[*rest * shares, bare])
     return HandleStyle(
         kind=kind,
         reach=rng.uniform(0.035, 0.085),
@@ -82,7 +90,7 @@ def handle(style: HandleStyle, x: Range, y: Range, z: Range, edge: Side | None) 
     The handle stays within the panel's outline, so that it never meets a neighbour, and is rooted half-way
     into the panel, so that it also holds on a recessed field.
     """
-    if style.kind == "none":
+    if style.kind in ("none", "recessed"):
         return []
     upright = edge in ("left", "right")
     along, across = (y, x) if upright else (x, y)
@@ -149,32 +157,64 @@ def handle(style: HandleStyle, x: Range, y: Range, z: Range, edge: Side | None) 
     return [*posts, bar]
 
 
-def panel(name: str, style: FrontStyle, x: Range, y: Range, z: Range) -> list[Piece]:
-    """A flat panel, or four rails around a recessed field where the panel is large enough for them."""
-    rail = style.rail
-    if rail <= 0 or min(x[1] - x[0], y[1] - y[0]) < 4 * rail:
-        return [box(name, x, y, z)]
+def panel(name: str, style: FrontStyle, x: Range, y: Range, z: Range, edge: Side | None) -> list[Piece]:
+    """A panel with its handle near its free edge, or in its middle if edge is None.
+
+    It is flat, or has four rails around a recessed field where it is large enough for them, or a recessed grip.
+    """
+    rail, size = style.rail, (x[1] - x[0], y[1] - y[0])
+    if style.handle.kind == "recessed":
+        return _hollowed(name, "handle", x, y, z, *_grip(style.handle, x, y, edge), 0.7)
+    fixed = handle(style.handle, x, y, z, edge)
+    if rail <= 0 or min(size) < 4 * rail:
+        return [box(name, x, y, z), *fixed]
     inner_x, inner_y = (x[0] + rail, x[1] - rail), (y[0] + rail, y[1] - rail)
+    return _hollowed(name, f"{name}_field", x, y, z, inner_x, inner_y, style.recess) + fixed
+
+
+def _grip(style: HandleStyle, x: Range, y: Range, edge: Side | None) -> tuple[Range, Range]:
+    """Ranges in x and y of a recessed grip: along the free edge, or below the upper one of a panel that slides."""
+    upright = edge in ("left", "right")
+    along, across = (y, x) if upright else (x, y)
+    run, width = along[1] - along[0], across[1] - across[0]
+    half_length = max(0.3 * style.length, 0.06) * run
+    half_width = min(2 * style.thickness, 0.15 * width)
+    middle = (along[0] + along[1]) / 2 + (0.8 * style.shift * (run / 2 - half_length) if upright else 0.0)
+    inset = min(max(style.inset, 1.5 * half_width), 0.3 * width)
+    beside = across[0] + inset if edge in ("left", "bottom") else across[1] - inset
+    long, wide = (middle - half_length, middle + half_length), (beside - half_width, beside + half_width)
+    return (wide, long) if upright else (long, wide)
+
+
+def _hollowed(
+    name: str, floor: str, x: Range, y: Range, z: Range, hole_x: Range, hole_y: Range, depth: float
+) -> list[Piece]:
+    """A panel that is thinner within a rectangle, by `depth` of its thickness."""
     return [
-        box(name, (x[0], inner_x[0]), y, z),
-        box(name, (inner_x[1], x[1]), y, z),
-        box(name, inner_x, (y[0], inner_y[0]), z),
-        box(name, inner_x, (inner_y[1], y[1]), z),
-        box(f"{name}_field", inner_x, inner_y, (z[0], z[1] - style.recess * (z[1] - z[0]))),
+        box(name, (x[0], hole_x[0]), y, z),
+        box(name, (hole_x[1], x[1]), y, z),
+        box(name, hole_x, (y[0], hole_y[0]), z),
+        box(name, hole_x, (hole_y[1], y[1]), z),
+        box(floor, hole_x, hole_y, (z[0], z[1] - depth * (z[1] - z[0]))),
     ]
 
 
 def hinged_door(name: str, style: FrontStyle, side: Side, x: Range, y: Range, z: Range, upper: float) -> Part:
-    """A door that turns about its front edge on the given side.
+    """A door that turns about an axis in its front face, at its edge on the given side or a little inside.
 
-    With the axis in the front edge the panel sweeps no space behind or beside itself, except that its free
-    edge swings out by `swing_room` first: nothing of a body or neighbour that keeps this far is ever touched.
+    So the panel sweeps no space beside itself, except that its free edge swings out by `swing_room` first, and behind
+    itself no more than `BEHIND`: nothing of a body or neighbour that keeps this far is ever touched.
     """
-    origin = {"left": (x[0], 0.0), "right": (x[1], 0.0), "bottom": (0.0, y[0]), "top": (0.0, y[1])}[side]
-    pieces = [
-        *panel("door_surface", style, x, y, z),
-        *handle(style.handle, x, y, z, OPPOSITE[side]),
-    ]
+    # The back corner beside the axis sweeps a circle of radius hypot(inside, thickness).
+    thickness = z[1] - z[0]
+    inside = style.setback * ((thickness + BEHIND) ** 2 - thickness**2) ** 0.5
+    origin = {
+        "left": (x[0] + inside, 0.0),
+        "right": (x[1] - inside, 0.0),
+        "bottom": (0.0, y[0] + inside),
+        "top": (0.0, y[1] - inside),
+    }[side]
+    pieces = panel("door_surface", style, x, y, z, OPPOSITE[side])
     return Part(name, "hinge", HINGE_AXIS[side], upper, tuple(pieces), (*origin, z[1]))
 
 
@@ -195,8 +235,7 @@ def drawer(
     """An open-topped tray of sheets `sheet` m thick, with the front panel x, y, z; it slides to the front."""
     tx, ty, tz = tray
     pieces = [
-        *panel("drawer_front", style, x, y, z),
-        *handle(style.handle, x, y, z, None),
+        *panel("drawer_front", style, x, y, z, None),
         box("drawer_bottom", tx, (ty[0], ty[0] + sheet), tz),
         box("drawer_side", (tx[0], tx[0] + sheet), (ty[0] + sheet, ty[1]), tz),
         box("drawer_side", (tx[1] - sheet, tx[1]), (ty[0] + sheet, ty[1]), tz),

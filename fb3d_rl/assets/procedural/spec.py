@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.procedural.shapes import Piece, Vector
 
@@ -39,6 +40,14 @@ class Part:
     upper: float
     pieces: tuple[Piece, ...]
     origin: Vector = (0.0, 0.0, 0.0)
+
+    def moved(self, scale: float, shift: npt.NDArray[np.float64]) -> Part:
+        """The part with its points at scale * point + shift, with shift [3] in metres."""
+        pieces = tuple(piece.transformed(scale, shift) for piece in self.pieces)
+        if self.joint == "slider":
+            return replace(self, pieces=pieces, upper=scale * self.upper)
+        x, y, z = (scale * np.asarray(self.origin) + shift).tolist()
+        return replace(self, pieces=pieces, origin=(x, y, z))
 
 
 @dataclass(frozen=True)
@@ -70,18 +79,25 @@ class ObjectSpec:
         low, high = self.bounds()
         scale = 2.0 / float(np.linalg.norm(high - low))
         shift = -scale * (low + high) / 2
+        body = tuple(piece.transformed(scale, shift) for piece in self.body)
+        return replace(self, body=body, parts=tuple(part.moved(scale, shift) for part in self.parts))
 
-        def moved(pieces: tuple[Piece, ...]) -> tuple[Piece, ...]:
-            return tuple(piece.transformed(scale, shift) for piece in pieces)
+    def turned(self, angle: float) -> ObjectSpec:
+        """The object turned about the vertical by an angle, rad, so that its axes run along no coordinate axis."""
+        turn = Rotation.from_rotvec([0.0, angle, 0.0])
 
-        parts = []
-        for part in self.parts:
-            if part.joint == "hinge":
-                x, y, z = (scale * np.asarray(part.origin) + shift).tolist()
-                parts.append(replace(part, pieces=moved(part.pieces), origin=(x, y, z)))
-            else:
-                parts.append(replace(part, pieces=moved(part.pieces), upper=scale * part.upper))
-        return replace(self, body=moved(self.body), parts=tuple(parts))
+        def vector(values: Vector) -> Vector:
+            x, y, z = turn.apply(values).tolist()
+            return x, y, z
+
+        def pieces(items: tuple[Piece, ...]) -> tuple[Piece, ...]:
+            return tuple(replace(piece, vertices=turn.apply(piece.vertices)) for piece in items)
+
+        parts = [
+            replace(part, axis=vector(part.axis), origin=vector(part.origin), pieces=pieces(part.pieces))
+            for part in self.parts
+        ]
+        return replace(self, body=pieces(self.body), parts=tuple(parts))
 
 
 def write_object(spec: ObjectSpec, folder: Path, object_id: str) -> None:
