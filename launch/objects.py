@@ -59,14 +59,8 @@ def generate(options: argparse.Namespace) -> None:
     from rich.progress import Progress
 
     from fb3d_rl.assets import procedural
-    from fb3d_rl.assets.splits import TRAIN_CATEGORIES
 
-    named = {
-        "all": list(procedural.FAMILIES),
-        "train": [name for name in procedural.FAMILIES if name in TRAIN_CATEGORIES],
-        "test": [name for name in procedural.FAMILIES if name not in TRAIN_CATEGORIES],
-    }
-    categories = named.get(options.categories) or list(filter(None, options.categories.split(",")))
+    categories = procedural.expand(list(filter(None, options.categories.split(","))))
     procedural.check(categories, options.count, options.seed)
     with Progress() as bar:
         task = bar.add_task("objects", total=len(categories) * options.count)

@@ -8,6 +8,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rich.progress import Progress
+
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders, find_split_file
@@ -43,8 +45,8 @@ def procedural_catalog(
 
     Args:
         out: the folder.
-        categories: families to train on: each gives the split "train_train" ``count`` objects and "train_test"
-            ``held_out`` others; 0 for none.
+        categories: families to train on, see :func:`fb3d_rl.assets.procedural.expand`: each gives the split
+            "train_train" ``count`` objects and "train_test" ``held_out`` others; 0 for none.
         count: see above.
         held_out: see above.
         seed: of the objects.
@@ -53,6 +55,7 @@ def procedural_catalog(
     Raises:
         UserError: a category has no procedural family, or is to be trained on and unseen.
     """
+    categories, unseen = procedural.expand(categories), procedural.expand(unseen)
     both = [name for name in unseen if name in categories]
     if both:
         raise UserError(
@@ -62,17 +65,22 @@ def procedural_catalog(
     if unknown or not categories:
         wrong = ", ".join(unknown) or "the list is empty"
         raise UserError(f"assets.categories: {wrong}; choose from {', '.join(procedural.FAMILIES)}")
-    entries = []
     # Held-out objects come from another seed, so no training object can be among them.
-    for split, names, number, part_seed in (
-        ("train_train", categories, count, 2 * seed),
-        ("train_test", categories, held_out, 2 * seed + 1),
-        ("test", unseen, held_out, 2 * seed + 1),
-    ):
-        if number == 0 or not names:
-            continue
-        ids = procedural.generate(out / split, names, number, part_seed)
-        entries += [Entry(out / split / name, _category(out / split / name), split) for name in ids]
+    wanted = [
+        (split, names, number, part_seed)
+        for split, names, number, part_seed in (
+            ("train_train", categories, count, 2 * seed),
+            ("train_test", categories, held_out, 2 * seed + 1),
+            ("test", unseen, held_out, 2 * seed + 1),
+        )
+        if number and names
+    ]
+    entries = []
+    with Progress(transient=True) as bar:
+        task = bar.add_task("objects", total=sum(number * len(names) for _, names, number, _ in wanted))
+        for split, names, number, part_seed in wanted:
+            ids = procedural.generate(out / split, names, number, part_seed, lambda: bar.advance(task))
+            entries += [Entry(out / split / name, _category(out / split / name), split) for name in ids]
     return entries
 
 

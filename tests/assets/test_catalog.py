@@ -11,6 +11,8 @@ import pytest
 
 from fb3d_rl.assets.catalog import partnet_catalog, procedural_catalog
 from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.assets.procedural import FAMILIES
+from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
 from fb3d_rl.contract import UserError
 
 
@@ -57,6 +59,15 @@ def test_unseen_categories_are_a_split_of_their_own(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="Laptop is trained on"):
         procedural_catalog(tmp_path / "c", ["Laptop"], 1, 1, seed=0, unseen=["Laptop"])
     assert not (tmp_path / "c").exists()
+
+
+def test_words_stand_for_umpnets_categories(tmp_path: Path) -> None:
+    made = procedural_catalog(tmp_path / "a", ["train"], 1, 0, seed=0)
+    assert [e.category for e in made] == [name for name in FAMILIES if name in TRAIN_CATEGORIES]
+    made = procedural_catalog(tmp_path / "b", ["Box", "all"], 1, 0, seed=0)
+    assert sorted(e.category for e in made) == sorted(FAMILIES) == sorted(CATEGORIES)
+    with pytest.raises(UserError, match="Laptop is trained on"):
+        procedural_catalog(tmp_path / "c", ["train"], 1, 1, seed=0, unseen=["Laptop"])
 
 
 @pytest.mark.parametrize(("categories", "word"), [(["Microwave", "Spaceship"], "Spaceship"), ([], "empty")])

@@ -274,7 +274,9 @@ def test_flow_is_nonzero_exactly_on_what_moves(objects: list[tuple[Path, Link, l
             joint, frame = obj.joint_of(target), poses[target].numpy()
             arms = np.cross(frame[:3, :3] @ joint.axis, points - frame[:3, 3])
             expected = np.linalg.norm(arms, axis=-1) if joint.type == "revolute" else 1.0
-            np.testing.assert_allclose(length[moves], (STEP * expected * np.ones(len(points)))[moves], rtol=1e-4, atol=1e-12)
+            np.testing.assert_allclose(
+                length[moves], (STEP * expected * np.ones(len(points)))[moves], rtol=1e-4, atol=1e-12
+            )
 
 
 @settings(max_examples=60, deadline=None, derandomize=True, database=None)

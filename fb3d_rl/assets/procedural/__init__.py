@@ -17,9 +17,10 @@ import numpy as np
 
 from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
+from fb3d_rl.assets.splits import TRAIN_CATEGORIES
 from fb3d_rl.contract import UserError
 
-__all__ = ["FAMILIES", "ObjectSpec", "Part", "generate", "object_id", "sample"]
+__all__ = ["FAMILIES", "ObjectSpec", "Part", "expand", "generate", "object_id", "sample"]
 
 FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "StorageFurniture": cabinets.storage_furniture,
@@ -72,6 +73,16 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     return spec.normalised()
 
 
+def expand(categories: Sequence[str]) -> list[str]:
+    """The names of families that words name: themselves, or "all", "train" or "test" (UMPNet's halves of them)."""
+    groups = {
+        "all": list(FAMILIES),
+        "train": [name for name in FAMILIES if name in TRAIN_CATEGORIES],
+        "test": [name for name in FAMILIES if name not in TRAIN_CATEGORIES],
+    }
+    return list(dict.fromkeys(name for word in categories for name in groups.get(word, [word])))
+
+
 def check(categories: Sequence[str], count: int, seed: int) -> None:
     """Refuse what cannot be generated before anything is written.
 
@@ -98,7 +109,7 @@ def generate(
 
     Args:
         out: Folder of object folders; made if it is not there.
-        categories: Keys of `FAMILIES`.
+        categories: Keys of `FAMILIES`; see `expand` for words that name many.
         count: Objects per category.
         seed: Seed of the whole set, at least 0.
         progress: Called after each object.

@@ -163,8 +163,8 @@ def _drawer(
     inner_z: Range,
 ) -> Part:
     gap = carcass.clearance
-    sheet = min(0.6 * carcass.wall, 0.02)
     height = rng.uniform(0.5, 0.85) * (cell_y[1] - cell_y[0])
+    sheet = min(0.6 * carcass.wall, 0.02, 0.3 * height)
     length = (face[0] - inner_z[0] - gap) * rng.uniform(0.8, 1.0)
     tray = (
         (cell_x[0] + gap, cell_x[1] - gap),
