@@ -1,6 +1,8 @@
-"""Make procedural objects, look at objects, and find out what is wrong with them.
+"""Make procedural objects, unpack and list objects, look at them, and find out what is wrong with them.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|NAME,...] [--count 50] [--seed 0]
+python launch/objects.py unpack ARCHIVE --out DIR
+python launch/objects.py list DIR [--split SPLIT]
 python launch/objects.py validate DIR [--out FILE.json] [--workers N]
 python launch/objects.py preview DIR --out FILE.png|html [--split SPLIT] [--each N]
 """
@@ -39,6 +41,16 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--count", type=int, default=50, help="objects of each category (default: 50)")
     make.add_argument("--seed", type=int, default=0)
 
+    says = "unpack a .zip or .tar archive of objects; nothing in it can leave DIR"
+    unzip = commands.add_parser("unpack", help=says, description=says)
+    unzip.add_argument("archive", type=Path, metavar="ARCHIVE")
+    unzip.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to make")
+
+    says = "list the objects at or below DIR: category, split, parts"
+    table = commands.add_parser("list", help=says, description=says)
+    table.add_argument("dir", metavar="DIR")
+    table.add_argument("--split", default="all", help="a split, categories, ids or files, with commas (default: all)")
+
     says = "list what is wrong with the objects below DIR; the exit code is 1 if one of them cannot be used"
     check = commands.add_parser("validate", help=says, description=says)
     check.add_argument("dir", type=Path, metavar="DIR")
@@ -69,6 +81,45 @@ def generate(options: argparse.Namespace) -> None:
             procedural.generate(options.out, [category], options.count, options.seed, lambda: bar.advance(task))
         bar.update(task, description="objects")
     print(f"{len(categories) * options.count} objects of {len(categories)} categories: {options.out}")
+
+
+def unpack(options: argparse.Namespace) -> None:
+    """Unpack an archive."""
+    from rich.progress import DownloadColumn, Progress, TimeElapsedColumn
+
+    from fb3d_rl.assets.archive import unpack
+    from fb3d_rl.assets.folders import find_folders
+
+    with Progress(DownloadColumn(), TimeElapsedColumn()) as bar:
+        task = bar.add_task("", total=None)
+        unpack(options.archive, options.out, lambda size: bar.advance(task, size))
+    print(f"{len(find_folders(options.out))} objects: {options.out}")
+
+
+def listing(options: argparse.Namespace) -> None:
+    """List objects."""
+    from collections import Counter
+
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from fb3d_rl.assets.catalog import partnet_catalog
+    from fb3d_rl.flow.opening import openable_links
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ("object", "category", "split", "joints", "parts that open"):
+        table.add_column(name, overflow="fold")
+    entries = partnet_catalog(options.dir, options.split)
+    for entry in sorted(entries, key=lambda entry: (entry.category, entry.id)):
+        obj = entry.load()
+        parts = Counter(obj.links[link].semantic or "no name" for link in openable_links(obj))
+        names = ", ".join(f"{count} {name}" for name, count in sorted(parts.items()))
+        table.add_row(entry.id, entry.category, entry.split, str(len(obj.movable)), names)
+    Console().print(table)
+    splits = Counter(entry.split for entry in entries)
+    counts = ", ".join(f"{count} {split}" for split, count in sorted(splits.items()))
+    print(f"{len(entries)} objects of {len({entry.category for entry in entries})} categories: {counts}")
 
 
 def preview(options: argparse.Namespace) -> None:
@@ -136,6 +187,8 @@ def validate(options: argparse.Namespace) -> int:
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "generate": generate,
+    "unpack": unpack,
+    "list": listing,
     "validate": validate,
     "preview": preview,
 }

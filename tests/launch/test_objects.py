@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -37,6 +38,26 @@ def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert [entry["usable"] for entry in json.loads((tmp_path / "again.json").read_text())] == [True, False]
 
 
+def test_objects_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["generate", "--out", str(tmp_path), "--categories", "Oven,Laptop", "--count", "2"]) == 0
+    capsys.readouterr()
+    assert main(["list", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    assert "4 objects of 2 categories" in text and "proc-Laptop-0-0001" in text and "1 screen" in text
+    assert main(["list", str(tmp_path), "--split", "Oven"]) == 0
+    text = capsys.readouterr().out
+    assert "2 objects of 1 categories: 2 test" in text and "Laptop" not in text
+
+
+def test_archives_are_unpacked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    made = tmp_path / "made"
+    assert main(["generate", "--out", str(made), "--categories", "Phone", "--count", "2"]) == 0
+    archive = shutil.make_archive(str(tmp_path / "objects"), "xztar", made)
+    assert main(["unpack", archive, "--out", str(tmp_path / "out")]) == 0
+    assert "2 objects" in capsys.readouterr().out
+    assert sorted(find_folders(tmp_path / "out")) == sorted(find_folders(made))
+
+
 @pytest.mark.parametrize(("word", "count", "without"), [("all", 21, ""), ("train", 11, "Box"), ("test", 10, "Laptop")])
 def test_categories_by_split(tmp_path: Path, word: str, count: int, without: str) -> None:
     assert main(["generate", "--out", str(tmp_path), "--categories", word, "--count", "1"]) == 0
@@ -51,6 +72,8 @@ def test_categories_by_split(tmp_path: Path, word: str, count: int, without: str
         (["generate", "--out", "OUT", "--count", "0"], "at least 1"),
         (["generate", "--out", "OUT", "--seed", "-1"], "seed"),
         (["preview", "OUT", "--out", "sheet.png"], "is no folder"),
+        (["list", "OUT"], "is no folder"),
+        (["unpack", "OUT", "--out", "OUT"], "is no file"),
         (["preview", "OUT", "--out", "sheet.jpg"], ".png"),
         (["preview", "OUT", "--out", "sheet.png", "--each", "0"], "--each"),
     ],
