@@ -1,6 +1,6 @@
 """Measure throughput as ratios in one run on the same work; prints a table and writes JSON.
 
-python launch/benchmark.py                        steps, labels, workers, loading, a soak test; procedural objects
+python launch/benchmark.py                        steps, labels, workers, reading, loading, a soak test
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = ("steps", "labelling", "workers", "loading", "soak")
+BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -30,23 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("results/runs/benchmark.json"), help="JSON file to write")
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.contract import exit_code
 
-    try:
-        unknown = [name for name in options.names if name not in BENCHMARKS]
-        if unknown:
-            raise UserError(f"{unknown[0]} is no benchmark; choose from {', '.join(BENCHMARKS)}")
-        for key in ("rounds", "steps"):
-            if getattr(options, key) < 1:
-                raise UserError(f"--{key} {getattr(options, key)} is too small; give 1 or more")
-        run(options)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print("error: interrupted; nothing was written", file=sys.stderr)
-        return 2
-    return 0
+    return exit_code(lambda: run(options), interrupted="nothing was written")
 
 
 def run(options: argparse.Namespace) -> None:
@@ -55,6 +41,7 @@ def run(options: argparse.Namespace) -> None:
     from rich.table import Table
 
     from fb3d_rl.assets.catalog import find_objects
+    from fb3d_rl.contract import UserError
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
     from fb3d_rl.evaluation import benchmark
@@ -63,6 +50,12 @@ def run(options: argparse.Namespace) -> None:
     from fb3d_rl.flow.opening import openable_links
     from fb3d_rl.training.checkpoint import git_revision
 
+    unknown = [name for name in options.names if name not in BENCHMARKS]
+    if unknown:
+        raise UserError(f"{unknown[0]} is no benchmark; choose from {', '.join(BENCHMARKS)}")
+    for key in ("rounds", "steps"):
+        if getattr(options, key) < 1:
+            raise UserError(f"--{key} {getattr(options, key)} is too small; give 1 or more")
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())
@@ -77,6 +70,11 @@ def run(options: argparse.Namespace) -> None:
             elif name == "workers":
                 scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(), options.seed, limit=24)
                 results[name] = benchmark.worker_scaling(objects, scheduled, env, min(rounds, 3), status.update)
+            elif name == "reading":
+                if not options.root:  # the procedural objects are no longer on disk
+                    results[name] = {"not measured": "give --root"}
+                    continue
+                results[name] = benchmark.reading([obj.urdf.parent for obj in objects], status.update)
             elif name == "loading":
                 results[name] = benchmark.loading(objects, env, status.update)
             else:

@@ -23,8 +23,13 @@ def _device() -> EmbreeDevice:
     return EmbreeDevice()
 
 
-def triangle_scene(triangles: NDArray[np.float32]) -> EmbreeScene:
-    """A static scene of ``triangles`` [F, 3, 3], ready for ``run(origins, directions, ...)``."""
+def triangle_scene(vertices: NDArray[np.float32], faces: NDArray[np.int32] | None = None) -> EmbreeScene:
+    """A static scene of triangles, ready for ``run(origins, directions, ...)``.
+
+    Args:
+        vertices: [V, 3], or the corners [F, 3, 3] of each triangle.
+        faces: [F, 3] indices of vertices; not with corners.
+    """
     scene = EmbreeScene(_device())
-    TriangleMesh(scene, triangles)
+    TriangleMesh(scene, vertices, faces)
     return scene

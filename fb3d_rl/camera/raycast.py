@@ -81,9 +81,11 @@ class RaycastCamera:
         self._corners = np.zeros((len(shapes), 3, 8))  # of the bodies' bounding boxes
         for index, meshes in enumerate(shapes):
             if meshes:
-                triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes]).astype(np.float32)
-                self._scenes[index] = triangle_scene(triangles)
-                extents = zip(triangles.min((0, 1)), triangles.max((0, 1)), strict=True)
+                vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
+                starts = itertools.accumulate((len(mesh.vertices) for mesh in meshes), initial=0)
+                faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
+                self._scenes[index] = triangle_scene(vertices, np.concatenate(faces).astype(np.int32))
+                extents = zip(vertices.min(0), vertices.max(0), strict=True)
                 self._corners[index] = np.array(list(itertools.product(*extents))).T
         bounds = standing_bounds(obj)
         self.centre: NDArray[np.float64] = bounds.mean(0)

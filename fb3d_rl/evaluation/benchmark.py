@@ -9,7 +9,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
+from pathlib import Path
 from statistics import median
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import psutil
@@ -19,6 +21,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.partnet_mobility import load_objects
+from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
@@ -254,6 +258,35 @@ def _trials_per_second(
     run_trials("policy", policy, objects, scheduled, options, finished, collector)
     # From the first row on: what comes before is the start of the workers.
     return (len(ends) - 1) / (ends[-1] - ends[0])
+
+
+def reading(folders: Sequence[Path], progress: Progress) -> dict[str, Any]:
+    """Seconds to read objects' folders, without a cache and with one, and to build the trees that rays are cast in.
+
+    The trees are built where an object is first looked at: Embree offers no way to keep them on disk.
+    """
+    seconds = []
+    with TemporaryDirectory() as empty:
+        usual, os.environ["FB3D_CACHE"] = os.environ.get("FB3D_CACHE", ""), empty
+        try:
+            for turn in ("first", "second", "third"):
+                progress(f"{turn} read of {len(folders)} objects")
+                start = time.perf_counter()
+                objects, _ = load_objects(folders)
+                seconds.append(time.perf_counter() - start)
+        finally:
+            os.environ["FB3D_CACHE"] = usual
+    progress(f"trees of {len(objects)} objects")
+    start = time.perf_counter()
+    for obj in objects:
+        RaycastCamera(obj)
+    return {
+        "objects": len(objects),
+        "first read, s": seconds[0],
+        "read again, s": min(seconds[1:]),
+        "trees to cast rays in, s": time.perf_counter() - start,
+        "read again / first": min(seconds[1:]) / seconds[0],
+    }
 
 
 def loading(objects: Sequence[ArticulatedObject], options: EnvOptions, progress: Progress) -> dict[str, Any]:

@@ -70,6 +70,14 @@ def test_labelled_rows_are_those_that_the_learner_collects_alone(
     assert found["labelled by the expert, rows/s"] > 0
 
 
+def test_reading_begins_with_an_empty_cache_and_leaves_none(objects: list[ArticulatedObject]) -> None:
+    before = os.environ["FB3D_CACHE"]
+    found = benchmark.reading([obj.urdf.parent for obj in objects], silent)
+    assert os.environ["FB3D_CACHE"] == before
+    assert found["objects"] == 2 and found["trees to cast rays in, s"] > 0
+    assert 0 < found["read again, s"] < found["first read, s"]
+
+
 def test_one_core_is_given_back() -> None:
     threads = torch.get_num_threads()
     before = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
