@@ -84,7 +84,7 @@ select, button { font: inherit; color: inherit; background: var(--ground); borde
 figure { margin: 0; } figcaption { color: var(--soft); font-size: 13px; margin-top: 6px; overflow-wrap: anywhere; }
 td.named { padding-left: 26px; white-space: normal; max-width: 300px; overflow-wrap: break-word; }
 td.named .dot { float: left; margin: 5px 0 0 -17px; }
-video { width: 100%; border-radius: 6px; display: block; background: #fff; }
+video, figure img { width: 100%; border-radius: 6px; display: block; background: #fff; }
 @media (max-width: 600px) {
   main { padding: 20px 12px 48px; } .panel { padding: 8px; } .wide, .scroll { padding: 0; }
   dl { grid-template-columns: minmax(0, 1fr); } dd { margin-bottom: 6px; }

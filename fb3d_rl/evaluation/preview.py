@@ -159,5 +159,5 @@ def _html(groups: Groups, title: str) -> str:
                 f'<figure class="panel"><img alt="{name}" src="data:image/webp;base64,{data}">'
                 f"<figcaption>{name}</figcaption></figure>"
             )
-        blocks.append(f"<h2>{page.text(category)}</h2>{page.grid(tiles)}")
+        blocks += [f"<h2>{page.text(category)}</h2>", page.grid(tiles, "small")]
     return page.page(title, f"<h1>{page.text(title)}</h1>" + "".join(blocks))
