@@ -366,10 +366,14 @@ def _pedestal_desk(rng: np.random.Generator, size: tuple[float, float, float]) -
     return ObjectSpec("Table", "heavy", "furniture_body", tuple(body), tuple(parts))
 
 
+LEFT_HINGED = 0.3
+"""Share of single doors of refrigerators and safes that are hinged on the left; most are made for right hands."""
+
+
 def refrigerator(rng: np.random.Generator) -> ObjectSpec:
     """One door, freezer above or below, two doors side by side, or those above a drawer."""
     size = scaled_size(rng.uniform(0.6, 1.0), rng.uniform(1.0, 1.9), rng.uniform(0.55, 0.8))
-    side: CellKind = "left" if rng.random() < 0.5 else "right"
+    side: CellKind = "left" if rng.random() < LEFT_HINGED else "right"
     small, large = Cell(side, rng.uniform(0.35, 0.7), 1), Cell(side, 1.0, int(rng.integers(1, 4)))
     double = Cell("double", 1.0, int(rng.integers(1, 4)))
     layouts = [
@@ -430,7 +434,7 @@ def microwave(rng: np.random.Generator) -> ObjectSpec:
 def safe(rng: np.random.Generator) -> ObjectSpec:
     """A thick-walled box with one door, set in or in front, with a dial and a lever."""
     size = scaled_size(rng.uniform(0.8, 1.3), rng.uniform(0.8, 1.5), rng.uniform(0.8, 1.2))
-    side: Side = "left" if rng.random() < 0.5 else "right"
+    side: Side = "left" if rng.random() < LEFT_HINGED else "right"
     style = draw_front(rng, (0.05, 0.09), bare=0.0, framed=0.3)
     body, (door,) = build(
         rng,
@@ -451,7 +455,7 @@ def safe(rng: np.random.Generator) -> ObjectSpec:
 
 
 def _with_dial(rng: np.random.Generator, door: Part) -> Part:
-    """The door with a dial fixed on its middle."""
+    """The door with a dial, or a wheel of spokes, fixed on its middle."""
     points = np.concatenate([piece.vertices for piece in door.pieces if piece.name.startswith("door_surface")])
     (x0, y0, z0), (x1, y1, z1) = points.min(0), points.max(0)
     cx, cy = (x0 + x1) / 2, y0 + rng.uniform(0.4, 0.75) * (y1 - y0)
@@ -462,15 +466,37 @@ def _with_dial(rng: np.random.Generator, door: Part) -> Part:
         rng.uniform(0.04, 0.1),
         sides=16,
     )
+    if rng.random() < 0.4:
+        length, at = rng.uniform(0.08, 0.16), z1 + rng.uniform(0.03, 0.06)
+        hub = rod("handle", (cx, cy, (z0 + z1) / 2), (cx, cy, at + 0.012), 0.03, sides=8)
+        angles = rng.uniform(0, np.pi) + np.pi * np.arange(3) / 3
+        spokes = [
+            rod(
+                "handle",
+                (cx - length * np.cos(a), cy - length * np.sin(a), at),
+                (cx + length * np.cos(a), cy + length * np.sin(a), at),
+                0.012,
+                sides=8,
+            )
+            for a in angles
+        ]
+        return replace(door, pieces=(*door.pieces, hub, *spokes))
     return replace(door, pieces=(*door.pieces, dial))
 
 
 def oven(rng: np.random.Generator) -> ObjectSpec:
-    """A door that drops down below a control panel, sometimes above a drawer."""
+    """A door below a control panel, sometimes above a drawer or another door; it drops down, or is hinged at a side.
+
+    Cooking ranges have burners on top, and most of them a panel behind these.
+    """
     size = scaled_size(rng.uniform(0.8, 1.2), rng.uniform(0.9, 1.4), rng.uniform(0.8, 1.1))
-    cells = [Cell("bottom", 1.0, int(rng.integers(0, 3))), Cell("controls", rng.uniform(0.15, 0.3))]
-    if rng.random() < 0.4:
+    kind: CellKind = rng.choice(["bottom", "left", "right"], p=[0.86, 0.07, 0.07])
+    cells = [Cell(kind, 1.0, int(rng.integers(0, 3))), Cell("controls", rng.uniform(0.15, 0.3))]
+    below = rng.choice(["nothing", "drawer", "oven"], p=[0.5, 0.3, 0.2])
+    if below == "drawer":
         cells.insert(0, Cell("drawer", rng.uniform(0.25, 0.4)))
+    elif below == "oven":
+        cells.insert(0, Cell("bottom", rng.uniform(0.6, 1.1), int(rng.integers(0, 3))))
     handle = replace(draw_handle(rng, bare=0.0), kind="bar", length=rng.uniform(0.5, 0.85))
     body, parts = build(
         rng,
@@ -487,7 +513,27 @@ def oven(rng: np.random.Generator) -> ObjectSpec:
             door="door",
         ),
     )
+    if rng.random() < 0.6:
+        body += _burners(rng, size)
     return ObjectSpec("Oven", "heavy", "oven_body", tuple(body), tuple(parts))
+
+
+def _burners(rng: np.random.Generator, size: tuple[float, float, float]) -> list[Piece]:
+    """Four burners on top of a range of this size, with a grate or without, and often a panel behind them."""
+    width, y, depth = size
+    pieces = []
+    if rng.random() < 0.7:
+        rise = rng.uniform(0.05, 0.35)
+        pieces.append(box("back_panel", (-width / 2, width / 2), (y, y + rise), (-depth / 2, -depth / 2 + 0.06)))
+    radius, tall, grate = rng.uniform(0.12, 0.2) * min(width, depth), rng.uniform(0.005, 0.03), rng.random() < 0.5
+    for cx in (-0.25 * width, 0.25 * width):
+        for cz in (-0.2 * depth, 0.25 * depth):
+            pieces.append(rod("burner", (cx, y, cz), (cx, y + tall, cz), radius))
+            if grate:
+                bar = (y + tall, y + tall + 0.02)
+                pieces.append(box("grate", (cx - 1.2 * radius, cx + 1.2 * radius), bar, (cz - 0.01, cz + 0.01)))
+                pieces.append(box("grate", (cx - 0.01, cx + 0.01), bar, (cz - 1.2 * radius, cz + 1.2 * radius)))
+    return pieces
 
 
 def dishwasher(rng: np.random.Generator) -> ObjectSpec:

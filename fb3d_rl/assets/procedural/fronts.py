@@ -199,11 +199,14 @@ def _hollowed(
     ]
 
 
-def hinged_door(name: str, style: FrontStyle, side: Side, x: Range, y: Range, z: Range, upper: float) -> Part:
+def hinged_door(
+    name: str, style: FrontStyle, side: Side, x: Range, y: Range, z: Range, upper: float, inward: bool = False
+) -> Part:
     """A door that turns about an axis in its front face, at its edge on the given side or a little inside.
 
     So the panel sweeps no space beside itself, except that its free edge swings out by `swing_room` first, and behind
-    itself no more than `BEHIND`: nothing of a body or neighbour that keeps this far is ever touched.
+    itself no more than `BEHIND`: nothing of a body or neighbour that keeps this far is ever touched. One that opens
+    inward, to the back, is the mirror image: its axis lies in its back face.
     """
     # The back corner beside the axis sweeps a circle of radius hypot(inside, thickness).
     thickness = z[1] - z[0]
@@ -215,7 +218,9 @@ def hinged_door(name: str, style: FrontStyle, side: Side, x: Range, y: Range, z:
         "top": (0.0, y[1] - inside),
     }[side]
     pieces = panel("door_surface", style, x, y, z, OPPOSITE[side])
-    return Part(name, "hinge", HINGE_AXIS[side], upper, tuple(pieces), (*origin, z[1]))
+    a, b, c = HINGE_AXIS[side]
+    axis: Vector = (-a, -b, -c) if inward else (a, b, c)
+    return Part(name, "hinge", axis, upper, tuple(pieces), (*origin, z[0] if inward else z[1]))
 
 
 def swing_room(width: float, thickness: float) -> float:

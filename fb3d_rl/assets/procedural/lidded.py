@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, box, circle, rectangle, rod, slab, wall
+from fb3d_rl.assets.procedural.shapes import Piece, Range, box, circle, loft, rectangle, rod, slab, wall
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 
@@ -173,7 +173,9 @@ def storage_box(rng: np.random.Generator) -> ObjectSpec:
     if kind == "lid":
         over = rng.uniform(0.0, 0.03)
         pieces = [box("lid_surface", (x[0] - over, x[1] + over), y, (z[0], z[1] + over))]
-        if rng.random() < 0.4:  # a raised, smaller field on top
+        if rng.random() < 0.3:  # a vault from side to side
+            pieces += _vault(x, height, z, rng.uniform(0.1, 0.5) * (z[1] - z[0]))
+        elif rng.random() < 0.4:  # a raised, smaller field on top
             rim = rng.uniform(0.06, 0.15)
             pieces.append(
                 box(
@@ -228,8 +230,16 @@ def storage_box(rng: np.random.Generator) -> ObjectSpec:
     return ObjectSpec("Box", "free", "box_body", tuple(body), tuple(parts))
 
 
+def _vault(x: Range, y: float, z: Range, rise: float) -> list[Piece]:
+    """The upper half of an elliptic cylinder along x, `rise` m high above the rectangle x, z at height y."""
+    angle = np.linspace(0.0, np.pi, 9)
+    profile = np.stack([y + rise * np.sin(angle), (z[0] + z[1]) / 2 + (z[1] - z[0]) / 2 * np.cos(angle)], 1)
+    ends = [np.insert(profile, 0, end, axis=1) for end in x]
+    return [loft("lid_surface", ends[0], ends[1])]
+
+
 def bucket(rng: np.random.Generator) -> ObjectSpec:
-    """A tapered bucket with a bail that lies on the rim, to the back or front, and is swung up."""
+    """A tapered bucket with a bail that lies around the rim, to the back or front, and is swung up, or over."""
     radius, height = rng.uniform(0.5, 0.65), rng.uniform(0.7, 1.2)
     foot = radius * rng.uniform(0.65, 0.9)
     thickness, floor = rng.uniform(0.015, 0.03), rng.uniform(0.02, 0.04)
@@ -247,7 +257,7 @@ def bucket(rng: np.random.Generator) -> ObjectSpec:
     angle = np.pi * np.arange(segments + 1) / segments
     corners = [(float(bail * np.cos(a)), pivot, float(side * bail * np.sin(a))) for a in angle]
     handle = [rod("handle", a, b, wire, sides=8) for a, b in zip(corners, corners[1:], strict=False)]
-    parts = (Part("handle", "hinge", (-side, 0, 0), rng.uniform(1.25, 2.2), tuple(handle), (0.0, pivot, 0.0)),)
+    parts = (Part("handle", "hinge", (-side, 0, 0), rng.uniform(1.25, 3.0), tuple(handle), (0.0, pivot, 0.0)),)
     return ObjectSpec("Bucket", "free", "bucket_body", tuple(body), parts)
 
 
