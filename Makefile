@@ -21,7 +21,7 @@ check: $(VENV)/installed
 	$(BIN)/lint-imports
 
 # mani-skill asks for opencv-python, whose window toolkit needs the system's libGL and glib; the headless build of the
-# same version is the same module without it.
+# same version is the same module without it. Reinstalled, because the two share files, which go with the former.
 OPENCV = $(shell sed -n 's/^opencv-python==//p' requirements.lock)
 
 # The file's date says when the lock was last installed.
@@ -30,7 +30,7 @@ $(VENV)/installed: requirements.lock pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip uninstall --quiet --yes opencv-python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps opencv-python-headless==$(OPENCV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --force-reinstall opencv-python-headless==$(OPENCV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 	touch $@
 

@@ -114,7 +114,7 @@ def test_impulses_tell_touch_and_force_like_points(
     env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
 ) -> None:
     """CUDA has no contact points; on the CPU both readers can look at the same physics step."""
-    obj = objects["StorageFurniture"]
+    obj = objects["Table"]
     drawer = links_called(obj, "drawer")[0]
     place_before(env, drawer, start(env, obj, drawer))
     stage, reader = env.stages[0], env.contact_impulses()

@@ -49,14 +49,14 @@ class Policy(TensorDictModuleBase):
 
 @pytest.fixture(scope="module")
 def create(objects: dict[str, ArticulatedObject]) -> partial[TrialEnv]:
-    return partial(make_env, [objects["Table"], objects["Oven"]], OPTIONS)
+    return partial(make_env, [objects["Table"], objects["Laptop"]], OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def trials(objects: dict[str, ArticulatedObject]) -> list[Trial]:
-    """Three of a door with one of a drawer between them."""
-    door, drawer = default_trial(objects["Oven"]), default_trial(objects["Table"])
-    return [dataclasses.replace(trial, seed=seed) for seed, trial in enumerate((door, drawer, door, door))]
+    """Three of a lid with one of a drawer between them."""
+    lid, drawer = default_trial(objects["Laptop"]), default_trial(objects["Table"])
+    return [dataclasses.replace(trial, seed=seed) for seed, trial in enumerate((lid, drawer, lid, lid))]
 
 
 def run(workers: Workers, trials: list[Trial]) -> list[Episode]:
