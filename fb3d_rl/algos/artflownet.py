@@ -109,11 +109,13 @@ def new_network(seed: int, **kwargs: Any) -> ArtFlowNet:
 
 
 def load_network(path: str | Path) -> ArtFlowNet:
-    """The network of a checkpoint that :func:`run` wrote.
+    """The network of a checkpoint that :func:`run` wrote, of a .safetensors file, or "pretrained".
 
     Raises:
         UserError: the file is missing or no such checkpoint.
     """
+    if str(path) == "pretrained" or Path(path).suffix == ".safetensors":
+        return ArtFlowNet.from_pretrained(path)
     content = load_checkpoint(path, algo="artflownet")
     net = ArtFlowNet(**content["model_kwargs"])
     net.load_state_dict(content["state"]["model"])

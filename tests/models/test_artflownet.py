@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from pathlib import Path
+
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
-from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
+from fb3d_rl.contract import UserError
+from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, artflownet_module
 
 
 def make_net(part_mask_input: bool = True) -> ArtFlowNet:
@@ -95,3 +99,80 @@ def test_widths_are_those_of_pointnet2() -> None:
         (128, 129), (128, 128), (128, 128),
         (128, 128), (128, 128), (3, 128),
     ]  # fmt: skip
+
+
+def test_a_small_cloud_is_predicted_as_it_is() -> None:
+    net = make_net()
+    points, valid, mask = make_batch()
+    expected = net.eval()(points[:1], valid[:1], mask[:1])[0]
+    net.train()
+    missing = points[0].masked_fill(~valid[0, :, None], torch.nan)
+    torch.testing.assert_close(net.predict(missing, mask[0]), expected, atol=1e-4, rtol=1e-4)
+    assert net.training, "the mode is left as it was"
+    array = net.predict(missing.numpy(), mask[0].numpy())
+    assert isinstance(array, np.ndarray) and array.dtype == np.float32
+    np.testing.assert_allclose(array, expected, atol=1e-4, rtol=1e-4)
+    np.testing.assert_array_equal(net.predict(missing.double().numpy(), mask[0]), array)
+
+
+@pytest.mark.parametrize("count", [0, 1, POINTS, POINTS + 1, 3000])
+def test_a_cloud_of_any_size_gets_a_flow_for_each_point(count: int) -> None:
+    net = make_net()
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
+    mask = points[:, 2] > 0.5
+    flow = net.predict(points, mask)
+    assert flow.shape == (count, 3) and torch.equal(flow, net.predict(points, mask))
+    assert (flow.norm(dim=1) > 0).all()
+
+
+def test_a_large_cloud_gets_what_its_parts_would() -> None:
+    """Dealt out at random, so that the flow of a point hardly depends on the cloud's size."""
+    net = make_net()
+    few = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(1))
+    many = torch.cat([few, torch.rand(2 * POINTS, 3, generator=torch.Generator().manual_seed(2))])
+    alone, among = net.predict(few, few[:, 2] > 0.5), net.predict(many, many[:, 2] > 0.5)[:POINTS]
+    assert torch.cosine_similarity(alone, among).median() > 0.95
+
+
+@pytest.mark.parametrize(
+    ("shape", "mask", "word"),
+    [((5, 2), torch.ones(5), "cloud"), ((2, 5, 3), torch.ones(5), "cloud"), ((5, 3), torch.ones(4), "mask"),
+     ((5, 3), None, "part_mask")],
+)  # fmt: skip
+def test_wrong_shapes_are_named(shape: tuple[int, ...], mask: torch.Tensor | None, word: str) -> None:
+    with pytest.raises(UserError, match=word):
+        make_net().predict(torch.zeros(shape), mask)
+    assert make_net(part_mask_input=False).predict(torch.rand(5, 3)).shape == (5, 3)
+
+
+def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
+    net = make_net().eval()
+    net.save_pretrained(tmp_path / "net.safetensors", {"command": "python launch/train.py"})
+    again = ArtFlowNet.from_pretrained(tmp_path / "net.safetensors")
+    assert not again.training and again.arguments == net.arguments
+    assert torch.equal(again(*make_batch()), net(*make_batch()))
+    assert [path.name for path in tmp_path.iterdir()] == ["net.safetensors"]
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "text", "pickle", "other", "missing"])
+def test_damaged_weights_end_in_one_sentence(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "net.safetensors"
+    make_net().save_pretrained(path)
+    content = bytearray(path.read_bytes())
+    if damage == "cut":
+        path.write_bytes(content[:-1000])
+    elif damage == "flip":
+        content[20] ^= 255
+        path.write_bytes(content)
+    elif damage == "text":
+        path.write_text("no weights")
+    elif damage == "pickle":
+        torch.save({"a": 1}, path)
+    elif damage == "other":
+        from safetensors.torch import save_file
+
+        save_file({"a": torch.zeros(3)}, path)
+    else:
+        path.unlink()
+    with pytest.raises(UserError, match=r"net\.safetensors"):
+        ArtFlowNet.from_pretrained(path)

@@ -1,0 +1,55 @@
+"""The dense network equals the fast one, and the exported program both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from fb3d_rl.contract import UserError
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.export import DenseArtFlowNet, export
+
+
+def trained(part_mask_input: bool = True) -> ArtFlowNet:
+    """A network whose batch norms have seen data and whose flow is of the size of 1."""
+    net = ArtFlowNet(part_mask_input, neighbors=16, generator=torch.Generator().manual_seed(0))
+    for _ in range(20):
+        net(*cloud(0))
+    with torch.no_grad():
+        net.eval().network.head[1].weight /= net(*cloud(0)).abs().max()
+    return net.eval()
+
+
+def cloud(seed: int, batch: int = 2, points: int = 300) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    places = torch.rand(batch, points, 3, generator=generator)
+    return places, torch.ones(batch, points, dtype=torch.bool), places[..., 2] > 0.5
+
+
+@pytest.mark.parametrize("part_mask_input", [True, False])
+def test_fast_and_dense_network_are_equal(part_mask_input: bool) -> None:
+    net = trained(part_mask_input)
+    points, valid, mask = cloud(1)
+    torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), net(points, valid, mask), atol=1e-4, rtol=1e-4)
+    net, points = net.double(), points.double()  # where no rounding hides a difference
+    expected = net(points, valid, mask)
+    assert expected.std() > 0.05
+    torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), expected, atol=1e-10, rtol=1e-10)
+
+
+def test_the_exported_program_equals_the_network(tmp_path: Path) -> None:
+    net, path = trained(), tmp_path / "net.pt2"
+    export(net, path, 300)
+    program = torch.export.load(path).module()
+    for seed, batch in ((1, 1), (2, 5)):
+        points, valid, mask = cloud(seed, batch)
+        torch.testing.assert_close(program(points, mask), net(points, valid, mask), atol=1e-5, rtol=1e-5)
+    assert [file.name for file in tmp_path.iterdir()] == ["net.pt2"]
+
+
+def test_too_few_points_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="16"):
+        export(trained(), tmp_path / "net.pt2", 3)
+    assert not any(tmp_path.iterdir())
