@@ -95,6 +95,7 @@ class ArtFlowNetConfig(AlgoConfig):
     lr: float
     schedule: str
     clip_norm: float | None
+    ema: float | None
     rotate: bool
     mirror: bool
     scale: float
@@ -389,6 +390,8 @@ def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
     _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
     for key in ("batch_size", "log_every", "neighbors"):
         _at_least(f"algo.{key}", getattr(algo, key), 1)
+    if algo.ema is not None and not 0 < algo.ema < 1:
+        raise UserError(f"algo.ema={algo.ema} is out of range; give a number between 0 and 1, or null")
     if not 0 <= algo.scale < 1:
         raise UserError(f"algo.scale={algo.scale} is out of range; give a number from 0 to below 1")
     for key in ("epochs", "lr"):

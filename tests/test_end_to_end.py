@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from fb3d_rl.algos.artflownet import run, run_evaluation
+from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.training.run_log import RunLog, read_rows
 
@@ -55,6 +55,8 @@ def test_a_run_leaves_what_it_promises(first: Path) -> None:
     assert [row.policy for row in rows] == ["expert"] * 2 + ["artflownet"] * 2
     assert all(row.contact for row in rows if row.policy == "expert")
     assert "nan" not in (first / "metrics.jsonl").read_text().lower()
+    best = max(row["val/cosine"] for row in read_rows(first / "metrics.jsonl") if "val/cosine" in row)
+    assert best_cosine(first / "best.safetensors") == best and load_network(first / "best.safetensors").arguments
 
 
 def test_the_same_seed_gives_the_same_bits(first: Path, tmp_path: Path, config: Config) -> None:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from safetensors import safe_open
+from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
@@ -20,7 +22,7 @@ from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
-from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
+from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, fit
 from fb3d_rl.training.run_log import RunLog
 
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
     from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, TrainConfig
 
 CHECKPOINT = "checkpoint.pt"
+
+BEST = "best.safetensors"
+"""The weights of the run that did best in validation."""
 
 
 def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
@@ -60,21 +65,33 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         )
     check(rows, "sample")
     buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
-    validation, _ = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
+    validation, about = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
+    split_of_row = [split for _, split, _ in about]
 
     algo = cast("ArtFlowNetConfig", cfg.algo)
     kwargs = {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors}
     net = new_network(cfg.seed, **kwargs)
 
-    def validate() -> dict[str, float]:
+    def validate(measured: nn.Module) -> dict[str, float]:
+        """On all held-out objects, and on those of each split where there are several."""
         flow, valid = validation["privileged", "flow"], validation["observation", "valid"]
-        numbers = mean_metrics(flow_metrics(predict(net, validation, device), flow, valid))
-        return {f"val/{key}": value for key, value in numbers.items()}
+        metrics = flow_metrics(predict(cast(ArtFlowNet, measured), validation, device), flow, valid)
+        numbers = {f"val/{key}": value for key, value in mean_metrics(metrics).items()}
+        for split in sorted(set(split_of_row)) if len(set(split_of_row)) > 1 else []:
+            rows = torch.tensor([other == split for other in split_of_row])
+            own = mean_metrics({key: value[rows] for key, value in metrics.items()})
+            numbers |= {f"val/{split}/{key}": value for key, value in own.items()}
+        if numbers["val/cosine"] > best_cosine(out / BEST):
+            about = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(cfg.seed), "git_revision": git_revision()}
+            cast(ArtFlowNet, measured).save_pretrained(out / BEST, about)
+        return numbers
 
     def checkpoint(state: dict[str, Any]) -> None:
         save_checkpoint(out / CHECKPOINT, algo="artflownet", config=asdict(cfg), model_kwargs=kwargs, state=state,
                         seed=cfg.seed)  # fmt: skip
 
+    if resume is None:
+        (out / BEST).unlink(missing_ok=True)
     with RunLog(out, resume_step=resume["step"] if resume else None) as run_log:
         fit(net, buffer, options, device=device, evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
             resume=resume["state"] if resume else None)  # fmt: skip
@@ -82,6 +99,14 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     policies["artflownet"] = artflownet_policy(net.to("cpu"), limits, speeds)
     return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
+
+
+def best_cosine(path: Path) -> float:
+    """Validation cosine of the weights in the file; -inf if there is none."""
+    if not path.is_file():
+        return -math.inf
+    with safe_open(path, framework="pt") as content:
+        return float(content.metadata()["val/cosine"])
 
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
@@ -93,6 +118,7 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
         lr=algo.lr,
         schedule=algo.schedule,
         clip_norm=algo.clip_norm,
+        ema=algo.ema,
         rotate=algo.rotate,
         mirror=algo.mirror,
         scale=algo.scale,
@@ -118,7 +144,7 @@ def load_network(path: str | Path) -> ArtFlowNet:
         return ArtFlowNet.from_pretrained(path)
     content = load_checkpoint(path, algo="artflownet")
     net = ArtFlowNet(**content["model_kwargs"])
-    net.load_state_dict(content["state"]["model"])
+    net.load_state_dict(content["state"].get("average") or content["state"]["model"])
     return net.eval()
 
 

@@ -23,6 +23,8 @@ import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
+from torch.optim.swa_utils import get_ema_multi_avg_fn as ema_of
 
 from fb3d_rl.contract import UserError
 
@@ -51,6 +53,8 @@ class FitOptions:
         lr: Adam's learning rate (paper: 1e-4); the peak if the schedule is not constant.
         schedule: "constant", or "one_cycle": up from lr / 25 in the first tenth, then down a cosine to 0.
         clip_norm: largest norm of the gradient; None leaves it alone.
+        ema: decay of an exponential moving average of the weights, such as 0.999, which is measured and kept in place
+            of the last weights; None for these.
         rotate: turn every drawn cloud and its flow by a random angle about z.
         mirror: reflect every other drawn cloud and its flow, at random, in the plane y = 0: a left-hinged door becomes
             a right-hinged one.
@@ -67,6 +71,7 @@ class FitOptions:
     lr: float = 1e-4
     schedule: str = "constant"
     clip_norm: float | None = None
+    ema: float | None = None
     rotate: bool = True
     mirror: bool = False
     scale: float = 0.0
@@ -88,6 +93,8 @@ class FitOptions:
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise UserError(f"{name}={value} must be greater than 0.")
+        if self.ema is not None and not 0 < self.ema < 1:
+            raise UserError(f"ema={self.ema} must lie between 0 and 1.")
 
 
 def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
@@ -209,7 +216,7 @@ def fit(
     *,
     objective: Objective | None = None,
     device: torch.device | str = "cpu",
-    evaluate: Callable[[], dict[str, float]] | None = None,
+    evaluate: Callable[[nn.Module], dict[str, float]] | None = None,
     log: Callable[[dict[str, Any]], None] | None = None,
     on_checkpoint: Callable[[dict[str, Any]], None] | None = None,
     resume: dict[str, Any] | None = None,
@@ -226,7 +233,8 @@ def fit(
         options: see FitOptions.
         objective: what is minimized; :func:`flow_objective` unless given.
         device: where to train; the model is moved there.
-        evaluate: measures the model, which is in evaluation mode meanwhile; its numbers go to the log.
+        evaluate: measures the model, or the average of its weights, which is in evaluation mode meanwhile; its numbers
+            go to the log.
         log: receives rows {"step": ..., "train/loss": ..., ...}; keys that start with "time/" differ between
             runs.
         on_checkpoint: receives the state to resume from; also called at the end and on Ctrl-C.
@@ -235,7 +243,8 @@ def fit(
         title: of the progress bar.
 
     Returns:
-        The last state: {"step", "model", "optimizer", "loss_sum", "loss_count", "options"}.
+        The last state: {"step", "model", "average", "optimizer", "loss_sum", "loss_count", "options"}. With ``ema`` the
+        model ends with the averaged weights, "average"; the last ones are "model", to go on from.
 
     Raises:
         UserError: there are no rows, the state belongs to other options, the loss is not finite, or Ctrl-C
@@ -249,17 +258,22 @@ def fit(
     model.to(device).train()
     objective = objective or flow_objective(model, options)
     optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
+    average = None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)
     step, loss_sum, loss_count = 0, 0.0, 0
     if resume is not None:
         _check_same_run(resume["options"], options)
         model.load_state_dict(resume["model"])
         optimizer.load_state_dict(resume["optimizer"])
         step, loss_sum, loss_count = resume["step"], resume["loss_sum"], resume["loss_count"]
+        if average is not None:
+            average.module.load_state_dict(resume["average"])
+            average.n_averaged.fill_(step)
 
     def state() -> dict[str, Any]:
         return {
             "step": step,
             "model": model.state_dict(),
+            "average": None if average is None else average.module.state_dict(),
             "optimizer": optimizer.state_dict(),
             "loss_sum": loss_sum,
             "loss_count": loss_count,
@@ -277,6 +291,8 @@ def fit(
         if options.clip_norm is not None:
             nn.utils.clip_grad_norm_(model.parameters(), options.clip_norm)
         optimizer.step()
+        if average is not None:
+            average.update_parameters(model)
         return value.item()
 
     def due(every: int | None) -> bool:
@@ -309,9 +325,10 @@ def fit(
                          "time/rows_per_s": rate})  # fmt: skip
                 loss_sum, loss_count = 0.0, 0
             if due(options.evaluate_every) and evaluate is not None:
-                model.eval()
-                numbers = evaluate()
-                model.train()
+                measured = model if average is None else average.module
+                measured.eval()
+                numbers = evaluate(measured)
+                measured.train()
                 if log is not None:
                     log({"step": step, **numbers})
             late = options.max_minutes is not None and seconds > 60 * options.max_minutes
@@ -322,18 +339,22 @@ def fit(
                 raise UserError(f"Stopped by Ctrl-C after step {step} of {options.steps}: {saved}.")
             if late:
                 break
+    last = state()
+    if average is not None:
+        last["model"] = {name: value.clone() for name, value in last["model"].items()}
+        model.load_state_dict(average.module.state_dict())
     model.eval()
-    return state()
+    return last
 
 
 def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:
     """Refuse to continue a run under options that would have led elsewhere."""
-    decisive = ["batch_size", "lr", "schedule", "clip_norm", "rotate", "mirror", "scale", "seed"]
+    decisive = ["batch_size", "lr", "schedule", "clip_norm", "ema", "rotate", "mirror", "scale", "seed"]
     if options.schedule != "constant":
         decisive.append("steps")
     for name in decisive:
-        if before[name] != getattr(options, name):
+        if before.get(name) != getattr(options, name):
             raise UserError(
-                f"The checkpoint was trained with {name}={before[name]}, not {getattr(options, name)}: "
+                f"The checkpoint was trained with {name}={before.get(name)}, not {getattr(options, name)}: "
                 f"resume with the same value or start a new run."
             )

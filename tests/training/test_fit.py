@@ -4,6 +4,7 @@ import io
 import math
 import os
 import signal
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -56,8 +57,9 @@ def test_two_runs_have_the_same_bits() -> None:
     assert not same(runs[0]["model"], other["model"])
 
 
-def test_resumed_run_equals_straight_run() -> None:
-    options = FitOptions(steps=7, batch_size=4, lr=1e-3, schedule="one_cycle", log_every=2, checkpoint_every=3)
+@pytest.mark.parametrize("ema", [None, 0.8])
+def test_resumed_run_equals_straight_run(ema: float | None) -> None:
+    options = FitOptions(steps=7, batch_size=4, lr=1e-3, schedule="one_cycle", log_every=2, checkpoint_every=3, ema=ema)
     states: list[dict[str, Any]] = []
     logs: tuple[list[dict[str, Any]], ...] = ([], [])
 
@@ -69,12 +71,12 @@ def test_resumed_run_equals_straight_run() -> None:
 
     straight = fit(
         make_net(), make_rows(), options, on_checkpoint=keep, log=logs[0].append, progress=False,
-        evaluate=lambda: {"flow/cosine": 0.5},
+        evaluate=lambda net: {"weight": float(net.network.head[1].weight.detach().sum())},
     )  # fmt: skip
     assert [state["step"] for state in states] == [3, 6, 7]
     resumed = fit(
         make_net(seed=9), make_rows(), options, resume=states[0], log=logs[1].append, progress=False,
-        evaluate=lambda: {"flow/cosine": 0.5},
+        evaluate=lambda net: {"weight": float(net.network.head[1].weight.detach().sum())},
     )  # fmt: skip
     assert same(straight, resumed)
 
@@ -85,8 +87,29 @@ def test_resumed_run_equals_straight_run() -> None:
     assert without_times(logs[0])[1:] == without_times(logs[1])
 
     with pytest.raises(UserError, match="seed=0"):
-        fit(make_net(), make_rows(), FitOptions(steps=7, batch_size=4, lr=1e-3, schedule="one_cycle", seed=4),
-            resume=states[0], progress=False)  # fmt: skip
+        other = replace(options, seed=4)
+        fit(make_net(), make_rows(), other, resume=states[0], progress=False)
+
+
+def test_the_average_follows_the_weights_and_is_what_remains() -> None:
+    """After Polyak: the first weights, then decay * average + (1 - decay) * weights, buffers included."""
+    weights: list[dict[str, torch.Tensor]] = []
+    measured: list[torch.Tensor] = []
+    net = make_net()
+    last = fit(
+        net, make_rows(), FitOptions(steps=4, batch_size=4, lr=1e-2, ema=0.6, evaluate_every=1, checkpoint_every=1),
+        evaluate=lambda model: measured.append(model.network.head[1].weight.clone()) or {},
+        on_checkpoint=lambda state: weights.append({key: value.clone() for key, value in state["model"].items()}),
+        progress=False,
+    )  # fmt: skip
+    for name in ("network.head.1.weight", "network.sa1.layers.0.norm.running_mean"):
+        average = weights[0][name]
+        for later in weights[1:4]:
+            average = 0.6 * average + 0.4 * later[name]
+        torch.testing.assert_close(net.state_dict()[name], average, atol=1e-6, rtol=1e-5)
+        assert torch.equal(last["average"][name], net.state_dict()[name])
+        assert torch.equal(last["model"][name], weights[3][name]) and not torch.allclose(average, weights[3][name])
+    assert torch.equal(measured[3], net.network.head[1].weight)
 
 
 def test_overfits_four_clouds() -> None:
