@@ -57,6 +57,10 @@ def door(rng: np.random.Generator) -> ObjectSpec:
     else:
         leaves = [((left, right), "left" if rng.random() < 0.5 else "right")]
     inward = bool(rng.random() < 0.3)
+    if inward:  # what stands out in front of the leaf swings beyond its free edge: keep it away from there
+        grip = style.handle
+        kind = "bar" if grip.kind == "lip" else grip.kind
+        style = replace(style, handle=replace(grip, kind=kind, inset=max(grip.inset, 0.06)))
     swing = (1.3, np.pi / 2) if inward else (1.3, 2.0)
     parts = [
         hinged_door("rotation_door", style, side, leaf_x, leaf_y, (-thickness, 0.0), rng.uniform(*swing), inward)
