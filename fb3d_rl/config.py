@@ -60,6 +60,7 @@ class DataConfig:
     closed_share: float
     others_closed: float
     all_parts_share: float
+    some_parts_share: float
 
 
 @dataclass
@@ -298,6 +299,19 @@ class EvaluationConfig:
 
 
 @dataclass
+class LoggerConfig:
+    """fb3d_rl.training.run_log.open_logger: where a run's numbers go besides metrics.jsonl.
+
+    Attributes:
+        name: "none", "csv", "tensorboard" or "wandb".
+        project: of Weights & Biases.
+    """
+
+    name: str
+    project: str
+
+
+@dataclass
 class CommandConfig:
     """What launch/train.py and launch/evaluate.py share."""
 
@@ -317,6 +331,7 @@ class TrainConfig(CommandConfig):
     """Everything that launch/train.py needs; ``resume`` goes on from the run folder's checkpoint."""
 
     algo: AlgoConfig
+    logger: LoggerConfig
     resume: bool
 
 
@@ -344,6 +359,7 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
         _one_of("algo.name", cfg.algo.name, ("artflownet", "bc", "dagger"))
+        _one_of("logger.name", cfg.logger.name, ("none", "csv", "tensorboard", "wandb"))
         _one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         if isinstance(cfg.algo, ArtFlowNetConfig):
             _validate_artflownet(cfg.algo)
@@ -368,7 +384,7 @@ def validate(cfg: CommandConfig) -> None:
     _at_least("evaluation.trials", 0 if cfg.evaluation.trials is None else cfg.evaluation.trials, 0)
     _at_least("evaluation.clouds", cfg.evaluation.clouds, 0)
     _at_least("evaluation.videos", cfg.evaluation.videos, 0)
-    for key in ("closed_share", "others_closed", "all_parts_share"):
+    for key in ("closed_share", "others_closed", "all_parts_share", "some_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:
             raise UserError(f"data.{key}={getattr(cfg.data, key)} is no share; give a number from 0 to 1")
     for key in ("azimuth", "elevation"):

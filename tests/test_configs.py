@@ -192,6 +192,7 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("algo.lr=0", "algo.lr"),
         ("data.points=3", "data.points"),
         ("data.closed_share=1.5", "data.closed_share"),
+        ("data.some_parts_share=-0.5", "data.some_parts_share"),
         ("data.workers=-1", "data.workers"),
         ("camera.azimuth=[10,-10]", "camera.azimuth"),
         ("camera.elevation=[10]", "camera.elevation"),

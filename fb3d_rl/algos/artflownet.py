@@ -24,7 +24,7 @@ from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, fit
-from fb3d_rl.training.run_log import RunLog
+from fb3d_rl.training.run_log import RunLog, open_logger
 
 if TYPE_CHECKING:
     from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, TrainConfig
@@ -46,6 +46,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     protocol = setup.protocol(cfg)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
+    logger = open_logger(cfg.logger.name, cfg.logger.project, out)
     options = fit_options(cfg)
     samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
@@ -92,7 +93,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
     if resume is None:
         (out / BEST).unlink(missing_ok=True)
-    with RunLog(out, resume_step=resume["step"] if resume else None) as run_log:
+    with RunLog(out, resume_step=resume["step"] if resume else None, logger=logger) as run_log:
         fit(net, buffer, options, device=device, evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
             resume=resume["state"] if resume else None)  # fmt: skip
 

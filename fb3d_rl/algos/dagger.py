@@ -43,7 +43,7 @@ from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, Interactive
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
 from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, Objective, fit, generator
-from fb3d_rl.training.run_log import RunLog
+from fb3d_rl.training.run_log import RunLog, open_logger
 from fb3d_rl.training.schedules import beta
 
 if TYPE_CHECKING:
@@ -128,6 +128,7 @@ class Run:
         saved = load_checkpoint(out / CHECKPOINT, algo=algo.name) if cfg.resume and not begun else None
         self.resumed = saved is not None
         given = DemonstrationBuffer.open(algo.demonstrations) if algo.demonstrations else None
+        self.logger = open_logger(cfg.logger.name, cfg.logger.project, out)
 
         self.expert = expert_policy(self.limits, setup.flow_policy_options(cfg))
         flow_net = load_network(algo.flow_checkpoint) if algo.flow_checkpoint else None
@@ -187,7 +188,8 @@ class Run:
         options = setup.collector_options(self.cfg, spare=int(algo.overlap))  # a core for the fit
         horizon = self.protocol.env.horizon
         with ExitStack() as stack:
-            log = stack.enter_context(RunLog(self.out, resume_rows=done.log_rows if self.resumed else None))
+            kept = done.log_rows if self.resumed else None
+            log = stack.enter_context(RunLog(self.out, resume_rows=kept, logger=self.logger))
             bar = stack.enter_context(progress_bars())
             workers = stack.enter_context(Workers(create, self.policy, options, horizon))
             beside = stack.enter_context(ThreadPoolExecutor(1)) if algo.overlap else None

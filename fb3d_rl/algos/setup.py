@@ -79,6 +79,7 @@ def sample_options(cfg: CommandConfig) -> SampleOptions:
         closed_share=data.closed_share,
         others_closed=data.others_closed,
         all_parts_share=data.all_parts_share,
+        some_parts_share=data.some_parts_share,
     )
 
 

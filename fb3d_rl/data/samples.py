@@ -29,6 +29,7 @@ class SampleOptions:
         closed_share: share of samples whose target part is exactly closed; the others are uniform over its range.
         others_closed: probability that each other joint is closed rather than uniform over its range.
         all_parts_share: share of samples whose target is all movable parts (the reference's target), mask included.
+        some_parts_share: share of samples whose target is a part and a random choice of the other movable ones.
     """
 
     points: int = 1200
@@ -37,6 +38,7 @@ class SampleOptions:
     closed_share: float = 0.3
     others_closed: float = 0.7
     all_parts_share: float = 0.3
+    some_parts_share: float = 0.0
 
 
 class ObjectView:
@@ -50,11 +52,14 @@ class ObjectView:
         self.base = torch.as_tensor(standing_pose(obj))
         self.openable = openable_links(obj)
 
-    def direction(self, link: int | None) -> NDArray[np.float64]:
-        """Opening signs [J]: of the joint of ``link`` alone, or of all joints (None; endless ones turn forwards)."""
+    def direction(self, *links: int) -> NDArray[np.float64]:
+        """Opening signs [J]: of the joints of ``links`` alone, or of all joints unless given.
+
+        Endless ones turn forwards.
+        """
         signs = np.where(self.open < self.closed, -1.0, 1.0)
-        if link is not None:
-            signs[[other != link for other in self.obj.movable]] = 0.0
+        if links:
+            signs[[other not in links for other in self.obj.movable]] = 0.0
         return signs
 
     def cloud(
@@ -84,10 +89,14 @@ class ObjectView:
         )
         return normalize_flow(raw)
 
-    def sample(self, links: NDArray[np.int64], points: NDArray[np.float32], qpos: NDArray[np.float64],
-               link: int | None) -> TensorDict:  # fmt: skip
-        """The sample (contract group "sample") of a cloud whose target is ``link`` or all movable parts (None: -1)."""
-        direction = self.direction(link)
+    def sample(
+        self, links: NDArray[np.int64], points: NDArray[np.float32], qpos: NDArray[np.float64], *targets: int
+    ) -> TensorDict:
+        """The sample (contract group "sample") of a cloud whose targets are these links, or all movable parts.
+
+        Its "target" is the link if it is one, else -1.
+        """
+        direction = self.direction(*targets)
         moving = (direction != 0).astype(np.float64) @ self.tree.descendants.numpy().astype(np.float64) > 0
         valid = torch.as_tensor(links >= 0)
         return TensorDict(
@@ -98,7 +107,7 @@ class ObjectView:
                     "part_mask": torch.as_tensor(moving[links]) & valid,
                 },
                 "privileged": {"flow": self.flow(points, links, qpos, direction)},
-                "target": torch.tensor(-1 if link is None else link),
+                "target": torch.tensor(targets[0] if len(targets) == 1 else -1),
             },
             batch_size=[],
         )
@@ -115,8 +124,11 @@ def draw_sample(
         qpos[target] = 0.0 if rng.random() < options.closed_share else rng.random()
         qpos = view.closed + qpos * (view.open - view.closed)
         points, links = view.cloud(qpos, options.views.sample(rng), options.points, rng)
-        asked = link if rng.random() >= options.all_parts_share else None
+        share = rng.random()
         carried = view.obj.descendants(link)
         if np.isin(links, carried).sum() >= MIN_VISIBLE:
-            return view.sample(links, points, qpos, asked)
+            targets: tuple[int, ...] = (link,) if share >= options.all_parts_share else ()
+            if targets and share < options.all_parts_share + options.some_parts_share:
+                targets += tuple(other for other in view.obj.movable if other != link and rng.random() < 0.5)
+            return view.sample(links, points, qpos, *targets)
     return None

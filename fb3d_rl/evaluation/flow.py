@@ -38,7 +38,7 @@ def held_out_samples(
         if not view.openable:
             continue
         for target in TARGETS:
-            wanted = replace(options, all_parts_share=float(target == "all"))
+            wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0)
             for number in range(count):
                 rng = np.random.default_rng([seed, 4, zlib.crc32(obj.id.encode()), number])
                 sample = draw_sample(view, wanted, rng)

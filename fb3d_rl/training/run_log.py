@@ -1,4 +1,4 @@
-"""A run's numbers: metrics.jsonl, one JSON object a line."""
+"""A run's numbers: metrics.jsonl, one JSON object a line, and whatever logger of TorchRL's is wanted besides."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import math
 import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from fb3d_rl.contract import UserError
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers import Logger
 
 FILE_NAME = "metrics.jsonl"
 TIME_PREFIX = "time/"
@@ -22,12 +27,19 @@ class RunLog:
         resume_step: keep the rows up to this step, drop later ones, which a resumed run writes again. None
             starts an empty file.
         resume_rows: keep this many rows instead.
+        logger: gets the numbers too, by step.
 
     Attributes:
         rows: how many rows there are.
     """
 
-    def __init__(self, out_dir: Path | str, resume_step: int | None = None, resume_rows: int | None = None) -> None:
+    def __init__(
+        self,
+        out_dir: Path | str,
+        resume_step: int | None = None,
+        resume_rows: int | None = None,
+        logger: Logger | None = None,
+    ) -> None:
         folder = Path(out_dir)
         folder.mkdir(parents=True, exist_ok=True)
         self.path = folder / FILE_NAME
@@ -41,6 +53,7 @@ class RunLog:
         temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
         os.replace(temporary, self.path)
         self._file = self.path.open("a", encoding="utf-8")
+        self._logger = logger
 
     def write(self, row: dict[str, Any]) -> None:
         """Append one row. JSON knows no nan or infinity: they become null."""
@@ -50,6 +63,10 @@ class RunLog:
         self._file.write(json.dumps(plain) + "\n")
         self._file.flush()
         self.rows += 1
+        if self._logger is not None:
+            for key, value in plain.items():
+                if key != "step" and isinstance(value, (int, float)):
+                    self._logger.log_scalar(key, float(value), step=row.get("step"))
 
     def close(self) -> None:
         """Close the file."""
@@ -64,6 +81,30 @@ class RunLog:
     ) -> None:
         """Close the file."""
         self.close()
+
+
+def open_logger(name: str, project: str, out: Path) -> Logger | None:
+    """TorchRL's logger of this name, which writes below ``out``/name; None for "none".
+
+    Args:
+        name: "none", "csv", "tensorboard" or "wandb".
+        project: of Weights & Biases.
+        out: the run's folder.
+
+    Raises:
+        UserError: its package is not installed.
+    """
+    if name == "none":
+        return None
+    from torchrl.record.loggers import get_logger
+
+    kwargs = {"wandb_kwargs": {"project": project}} if name == "wandb" else {}
+    (out / name).mkdir(parents=True, exist_ok=True)
+    try:
+        return get_logger(name, logger_name=str(out / name), experiment_name=out.name, **kwargs)
+    except ImportError as error:
+        (out / name).rmdir()
+        raise UserError(f"logger={name} needs a package that is not installed: pip install {name}") from error
 
 
 def read_rows(path: Path | str, times: bool = True) -> list[dict[str, Any]]:

@@ -44,6 +44,25 @@ def test_mask_is_where_the_flow_is(views: list[ObjectView], all_parts: float) ->
                 assert int(sample["target"]) in view.openable and int(mask.sum()) >= MIN_VISIBLE
 
 
+def test_some_parts_are_a_part_and_others_with_it(views: list[ObjectView]) -> None:
+    view = next(v for v in views if v.obj.category == "StorageFurniture")
+    options = dataclasses.replace(OPTIONS, all_parts_share=0.2, some_parts_share=0.5)
+    counts, tree = [], view.tree.descendants.numpy()
+    for seed in range(80):
+        sample = draw_sample(view, options, np.random.default_rng(seed))
+        alone = draw_sample(view, dataclasses.replace(options, some_parts_share=0.0), np.random.default_rng(seed))
+        assert sample is not None and alone is not None
+        mask, own = sample["observation", "part_mask"], alone["observation", "part_mask"]
+        norm = sample["privileged", "flow"].norm(dim=-1)
+        assert (norm[~mask] == 0).all() and (norm[mask] > 1e-6).float().mean() > 0.95
+        assert not (own & ~mask).any(), "the part itself is always asked for"
+        more = bool((mask & ~own).any())
+        counts.append((int(alone["target"]) == -1, more))
+        assert (int(sample["target"]) == -1) >= more
+    assert not any(more for everything, more in counts if everything)
+    assert 0.3 < np.mean([more for _, more in counts]) < 0.6 and len(tree) > 2
+
+
 def test_padding_follows_the_points(views: list[ObjectView]) -> None:
     sample = draw_sample(views[0], dataclasses.replace(OPTIONS, points=2000), np.random.default_rng(0))
     assert sample is not None
@@ -69,7 +88,7 @@ def test_direction_points_towards_opening(views: list[ObjectView]) -> None:
             j = view.obj.movable.index(link)
             assert direction[j] == np.sign(view.open[j] - view.closed[j])
             assert np.count_nonzero(direction) == 1
-        assert np.count_nonzero(view.direction(None)) == len(view.obj.movable)
+        assert np.count_nonzero(view.direction()) == len(view.obj.movable)
 
 
 def test_flow_leads_from_closed_to_open(views: list[ObjectView]) -> None:
