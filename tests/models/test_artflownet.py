@@ -104,7 +104,7 @@ def test_widths_are_those_of_pointnet2() -> None:
 def test_a_small_cloud_is_predicted_as_it_is() -> None:
     net = make_net()
     points, valid, mask = make_batch()
-    expected = net.eval()(points[:1], valid[:1], mask[:1])[0]
+    expected = net.eval()(points[:1], valid[:1], mask[:1])[0].detach()
     net.train()
     missing = points[0].masked_fill(~valid[0, :, None], torch.nan)
     torch.testing.assert_close(net.predict(missing, mask[0]), expected, atol=1e-4, rtol=1e-4)
