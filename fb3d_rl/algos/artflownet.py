@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
+from tensordict import TensorDict
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
-from fb3d_rl.contract import check
+from fb3d_rl.contract import UserError, check
 from fb3d_rl.data.generate import generate_samples
 from fb3d_rl.evaluation.evaluate import evaluate
 from fb3d_rl.evaluation.flow import held_out_samples, predict
@@ -24,6 +25,7 @@ from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, fit
+from fb3d_rl.training.processes import rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
 
 if TYPE_CHECKING:
@@ -39,8 +41,11 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     """Train on the configured objects and evaluate on the held-out ones; everything is written below ``out``.
 
     Returns:
-        One row for each scheduled trial and policy.
+        One row for each scheduled trial and policy; none in the processes that only fit beside the first.
     """
+    if rank_and_count()[0]:
+        assist(cfg, out)
+        return []
     # Whatever the configuration can get wrong shows here, before any work.
     device = setup.choose_device(cfg.device)
     protocol = setup.protocol(cfg)
@@ -65,13 +70,12 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
             lambda done: bar.update(task, completed=done),
         )
     check(rows, "sample")
+    wait_for_all()
     buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
     validation, about = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
     split_of_row = [split for _, split, _ in about]
 
-    algo = cast("ArtFlowNetConfig", cfg.algo)
-    kwargs = {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors}
-    net = new_network(cfg.seed, **kwargs)
+    net = new_network(cfg.seed, **network_arguments(cfg))
 
     def validate(measured: nn.Module) -> dict[str, float]:
         """On all held-out objects, and on those of each split where there are several."""
@@ -88,8 +92,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         return numbers
 
     def checkpoint(state: dict[str, Any]) -> None:
-        save_checkpoint(out / CHECKPOINT, algo="artflownet", config=asdict(cfg), model_kwargs=kwargs, state=state,
-                        seed=cfg.seed)  # fmt: skip
+        path, config = out / CHECKPOINT, asdict(cfg)
+        save_checkpoint(path, algo="artflownet", config=config, model_kwargs=net.arguments, state=state, seed=cfg.seed)
 
     if resume is None:
         (out / BEST).unlink(missing_ok=True)
@@ -102,6 +106,22 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
 
 
+def assist(cfg: TrainConfig, out: Path) -> None:
+    """Fit beside the first of several processes, which does all the rest, once the samples are there."""
+    device, options = setup.choose_device(cfg.device), fit_options(cfg)
+    resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
+    net = new_network(cfg.seed, **network_arguments(cfg))
+    wait_for_all()
+    buffer = TensorDictReplayBuffer(storage=TensorStorage(TensorDict.load_memmap(out / "samples" / "rows")))
+    fit(net, buffer, options, device=device, resume=resume["state"] if resume else None, progress=False)
+
+
+def network_arguments(cfg: TrainConfig) -> dict[str, Any]:
+    """The network's arguments."""
+    algo = cast("ArtFlowNetConfig", cfg.algo)
+    return {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors}
+
+
 def best_cosine(path: Path) -> float:
     """Validation cosine of the weights in the file; -inf if there is none."""
     if not path.is_file():
@@ -111,8 +131,14 @@ def best_cosine(path: Path) -> float:
 
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
-    """How ArtFlowNet is fitted."""
-    algo = cast("ArtFlowNetConfig", cfg.algo)
+    """How ArtFlowNet is fitted.
+
+    Raises:
+        UserError: the batch cannot be shared out to the processes that fit together.
+    """
+    algo, processes = cast("ArtFlowNetConfig", cfg.algo), rank_and_count()[1]
+    if algo.batch_size % processes:
+        raise UserError(f"algo.batch_size={algo.batch_size} cannot be shared out to {processes} processes equally")
     return FitOptions(
         steps=math.ceil(algo.epochs * cfg.data.train_samples / algo.batch_size),
         batch_size=algo.batch_size,

@@ -22,11 +22,13 @@ from typing import Any, Protocol, TypeAlias
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 from torch.optim.swa_utils import get_ema_multi_avg_fn as ema_of
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.training.processes import rank_and_count
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
 """The loss of a batch of rows [B] in step number k, a scalar."""
@@ -142,18 +144,23 @@ def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
     return chosen
 
 
-def flow_objective(model: nn.Module, options: FitOptions) -> Objective:
-    """:func:`flow_loss` of a flow network on clouds that are turned, mirrored and scaled as the options say."""
+def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
+    """:func:`flow_loss` of a flow network on clouds that are turned, mirrored and scaled as the options say.
+
+    ``share`` is the part of the whole batch that the objective is given.
+    """
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
         points, flow = batch["observation", "points"], batch["privileged", "flow"]
         valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
         device = points.device
         if options.rotate:
-            angle = torch.rand(len(points), generator=generator(options.seed, 2, step)).to(device) * (2 * math.pi)
+            angle = torch.rand(options.batch_size, generator=generator(options.seed, 2, step))[share]
+            angle = angle.to(device) * (2 * math.pi)
             points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
         if options.mirror or options.scale:
-            draws = torch.rand(2, len(points), 1, 1, generator=generator(options.seed, 3, step)).to(device)
+            draws = torch.rand(2, options.batch_size, 1, 1, generator=generator(options.seed, 3, step))[:, share]
+            draws = draws.to(device)
             if options.mirror:
                 reflect = torch.ones_like(points[:, :1])
                 reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
@@ -223,7 +230,10 @@ def fit(
     progress: bool = True,
     title: str = "training",
 ) -> dict[str, Any]:
-    """Train a network.
+    """Train a network, beside the other processes if torchrun started several (:mod:`fb3d_rl.training.processes`).
+
+    These compute equal shares of every batch, normalize each by its own statistics, and average their gradients. Only
+    the first is to evaluate, log and write checkpoints.
 
     Args:
         model: trained in place. A flow network is called as model(points [B, N, 3], valid [B, N], part_mask [B, N])
@@ -247,16 +257,16 @@ def fit(
         model ends with the averaged weights, "average"; the last ones are "model", to go on from.
 
     Raises:
-        UserError: there are no rows, the state belongs to other options, the loss is not finite, or Ctrl-C
-        was pressed
-            (after the checkpoint).
+        UserError: there are no rows, the state belongs to other options, the loss is not finite, or Ctrl-C was
+            pressed (after the checkpoint).
     """
     tune_cpu()
-    rows = len(buffer)
+    rows, (rank, processes) = len(buffer), rank_and_count()
+    share = slice(rank, None, processes)
     if rows == 0:
         raise UserError("There are no clouds to train on: generate flow samples first.")
     model.to(device).train()
-    objective = objective or flow_objective(model, options)
+    objective = objective or flow_objective(model if processes == 1 else DistributedDataParallel(model), options, share)
     optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
     average = None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)
     step, loss_sum, loss_count = 0, 0.0, 0
@@ -282,7 +292,7 @@ def fit(
 
     def update() -> float:
         """One step: draw, predict, descend; returns the loss."""
-        batch = buffer[batch_rows(step, rows, options)].to(device)
+        batch = buffer[batch_rows(step, rows, options)[share]].to(device)
         for group in optimizer.param_groups:
             group["lr"] = learning_rate(step, options)
         optimizer.zero_grad()
@@ -294,6 +304,14 @@ def fit(
         if average is not None:
             average.update_parameters(model)
         return value.item()
+
+    def agreed(loss: float, late: bool, stopped: bool) -> tuple[float, bool, bool]:
+        """Mean loss of all processes, and whether it is late or Ctrl-C was pressed for one of them."""
+        if processes == 1:
+            return loss, late, stopped
+        numbers = torch.tensor([loss / processes, float(late), float(stopped)], device=device)
+        distributed.all_reduce(numbers)
+        return float(numbers[0]), bool(numbers[1] > 0), bool(numbers[2] > 0)
 
     def due(every: int | None) -> bool:
         return step == options.steps or (every is not None and step % every == 0)
@@ -310,11 +328,13 @@ def fit(
         task = bar.add_task("", total=options.steps, completed=step, loss=math.nan, rate=0.0)
         while step < options.steps:
             loss = update()
+            seconds = time.perf_counter() - started
+            late = options.max_minutes is not None and seconds > 60 * options.max_minutes
+            loss, late, stopped = agreed(loss, late, interrupt.is_set())
             if not math.isfinite(loss):
                 raise UserError(f"The loss is {loss} after step {step + 1}: lower lr or set clip_norm.")
             # Counters move after the work that they count.
             step, loss_sum, loss_count = step + 1, loss_sum + loss, loss_count + 1
-            seconds = time.perf_counter() - started
             rate = (step - first) * options.batch_size / seconds
             bar.update(task, completed=step, loss=loss, rate=rate)
             if due(options.log_every):
@@ -331,10 +351,9 @@ def fit(
                 measured.train()
                 if log is not None:
                     log({"step": step, **numbers})
-            late = options.max_minutes is not None and seconds > 60 * options.max_minutes
-            if (due(options.checkpoint_every) or late or interrupt.is_set()) and on_checkpoint is not None:
+            if (due(options.checkpoint_every) or late or stopped) and on_checkpoint is not None:
                 on_checkpoint(state())
-            if interrupt.is_set():
+            if stopped:
                 saved = "a checkpoint was saved, resume from it to go on" if on_checkpoint else "nothing was saved"
                 raise UserError(f"Stopped by Ctrl-C after step {step} of {options.steps}: {saved}.")
             if late:

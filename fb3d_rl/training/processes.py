@@ -1,0 +1,53 @@
+"""One fit by several processes, as ``torchrun`` starts them: each computes a share of every batch."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import torch
+from torch import distributed
+
+
+def rank_and_count() -> tuple[int, int]:
+    """Number of this process among those that fit together, and how many there are: (0, 1) alone."""
+    if not distributed.is_initialized():
+        return 0, 1
+    return distributed.get_rank(), distributed.get_world_size()
+
+
+def wait_for_all() -> None:
+    """Return when all processes have come here; at once if there is one."""
+    if distributed.is_initialized():
+        distributed.barrier()
+
+
+@contextmanager
+def joined(out: Path, fresh: bool) -> Iterator[Path]:
+    """Join the processes that ``torchrun`` started; nothing happens without it.
+
+    Args:
+        out: the run folder that this process was given.
+        fresh: it is new, so that processes other than the first may remove theirs.
+
+    Yields:
+        The first process's run folder.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield out
+        return
+    cuda = torch.cuda.is_available()
+    if cuda:
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+    distributed.init_process_group("nccl" if cuda else "gloo")
+    try:
+        shared = [str(out.resolve())]
+        distributed.broadcast_object_list(shared)
+        if fresh and Path(shared[0]) != out.resolve():
+            shutil.rmtree(out)
+        yield Path(shared[0])
+    finally:
+        distributed.destroy_process_group()
