@@ -305,13 +305,13 @@ def fit(
             average.update_parameters(model)
         return value.item()
 
-    def agreed(loss: float, late: bool, stopped: bool) -> tuple[float, bool, bool]:
-        """Mean loss of all processes, and whether it is late or Ctrl-C was pressed for one of them."""
+    def summed(*numbers: float) -> list[float]:
+        """Each number's sum over all processes, which all of them must ask for."""
         if processes == 1:
-            return loss, late, stopped
-        numbers = torch.tensor([loss / processes, float(late), float(stopped)], device=device)
-        distributed.all_reduce(numbers)
-        return float(numbers[0]), bool(numbers[1] > 0), bool(numbers[2] > 0)
+            return list(numbers)
+        values = torch.tensor(numbers, device=device)
+        distributed.all_reduce(values)
+        return values.tolist()
 
     def due(every: int | None) -> bool:
         return step == options.steps or (every is not None and step % every == 0)
@@ -327,14 +327,12 @@ def fit(
     with Progress(*columns, disable=not progress) as bar, _deferred_interrupt() as interrupt:
         task = bar.add_task("", total=options.steps, completed=step, loss=math.nan, rate=0.0)
         while step < options.steps:
-            loss = update()
-            seconds = time.perf_counter() - started
-            late = options.max_minutes is not None and seconds > 60 * options.max_minutes
-            loss, late, stopped = agreed(loss, late, interrupt.is_set())
+            loss = summed(update())[0] / processes
             if not math.isfinite(loss):
                 raise UserError(f"The loss is {loss} after step {step + 1}: lower lr or set clip_norm.")
             # Counters move after the work that they count.
             step, loss_sum, loss_count = step + 1, loss_sum + loss, loss_count + 1
+            seconds = time.perf_counter() - started
             rate = (step - first) * options.batch_size / seconds
             bar.update(task, completed=step, loss=loss, rate=rate)
             if due(options.log_every):
@@ -351,6 +349,9 @@ def fit(
                 measured.train()
                 if log is not None:
                     log({"step": step, **numbers})
+            # Processes stop together, or the others would wait for this one for ever.
+            overdue = options.max_minutes is not None and seconds > 60 * options.max_minutes
+            late, stopped = (count > 0 for count in summed(overdue, interrupt.is_set()))
             if (due(options.checkpoint_every) or late or stopped) and on_checkpoint is not None:
                 on_checkpoint(state())
             if stopped:
