@@ -5,6 +5,7 @@ Every worker is a TorchRL collector of its own, so that one that dies takes noth
 
 from __future__ import annotations
 
+import gc
 import logging
 import multiprocessing
 import multiprocessing.resource_tracker
@@ -227,6 +228,7 @@ class Workers:
         if self._owns_ray:
             import ray
 
+            gc.collect()  # the finalizer of a collector that never came to be would start Ray anew
             ray.shutdown()
         if self._folder is not None:
             self._folder.cleanup()
@@ -385,6 +387,10 @@ class _Worker:
             if how is None:
                 raise
             self._collector = None
+            if not hasattr(collector, "procs"):
+                # Ray's: its finalizer would otherwise start Ray anew after Workers.close, and end this process when
+                # that has been gone for a minute.
+                collector.shutdown()
             raise _WorkerDied(how) from error
 
     def close(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import logging
 import multiprocessing
 import os
@@ -14,6 +15,7 @@ import pytest
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors.distributed import RayCollector
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import UserError
@@ -156,8 +158,11 @@ def test_worker_processes(
 
 @pytest.mark.slow
 def test_ray(create: partial[TrialEnv], trials: list[Trial], expected: dict[float, list[Episode]]) -> None:
-    pytest.importorskip("ray", reason="Ray is not installed; install it to run this test")
+    ray = pytest.importorskip("ray", reason="Ray is not installed; install it to run this test")
     assert "its Ray worker died" in check("ray", create, trials, expected)
+    # The finalizer of a collector that still has actors starts Ray anew.
+    left = [thing for thing in gc.get_objects() if isinstance(thing, RayCollector) and thing.remote_collectors]
+    assert not left and not ray.is_initialized()
 
 
 def test_ray_is_asked_for_where_it_is_missing(create: partial[TrialEnv], monkeypatch: pytest.MonkeyPatch) -> None:
