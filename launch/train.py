@@ -5,7 +5,6 @@ ArtFlowNet by several processes or GPUs: ``torchrun --nproc-per-node=N launch/tr
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +15,9 @@ def task(cfg: Any, out: Path) -> None:
     """Run the configured algorithm; its imports take seconds, so they come after the configuration's checks."""
     from fb3d_rl.algos import artflownet, dagger
     from fb3d_rl.contract import UserError
-    from fb3d_rl.training.processes import joined
+    from fb3d_rl.training.processes import joined, started
 
-    if cfg.algo.name != "artflownet" and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+    if cfg.algo.name != "artflownet" and started() > 1:
         raise UserError(f"algo={cfg.algo.name} is trained by one process: start it without torchrun")
     with joined(out, fresh=not cfg.resume) as shared:
         {"artflownet": artflownet.run, "bc": dagger.run, "dagger": dagger.run}[cfg.algo.name](cfg, shared)

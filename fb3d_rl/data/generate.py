@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import shutil
 import signal
 import threading
@@ -21,6 +20,7 @@ from tensordict import TensorDict, TensorDictBase
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.files import write_text
 
 DONE = "samples.json"
 
@@ -94,9 +94,7 @@ def generate_samples(
                 raise
     rows = TensorDict.load_memmap(out / "rows")
     _refill(rows, sorted(missing), count)
-    temporary = done_file.with_suffix(".tmp")
-    temporary.write_text(json.dumps({"recipe": recipe, "refilled": len(missing)}))
-    os.replace(temporary, done_file)
+    write_text(done_file, json.dumps({"recipe": recipe, "refilled": len(missing)}))
     return rows
 
 

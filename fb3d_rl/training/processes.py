@@ -12,6 +12,11 @@ import torch
 from torch import distributed
 
 
+def started() -> int:
+    """How many processes ``torchrun`` started; 1 without it."""
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
 def rank_and_count() -> tuple[int, int]:
     """Number of this process among those that fit together, and how many there are: (0, 1) alone."""
     if not distributed.is_initialized():
@@ -36,7 +41,7 @@ def joined(out: Path, fresh: bool) -> Iterator[Path]:
     Yields:
         The first process's run folder.
     """
-    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+    if started() == 1:
         yield out
         return
     cuda = torch.cuda.is_available()

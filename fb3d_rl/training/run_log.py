@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.files import write_text
 
 if TYPE_CHECKING:
     from torchrl.record.loggers import Logger
@@ -49,9 +49,7 @@ class RunLog:
         if resume_rows is not None and self.path.exists():
             kept = read_rows(self.path)[:resume_rows]
         self.rows = len(kept)
-        temporary = self.path.with_suffix(".part")
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept), encoding="utf-8")
-        os.replace(temporary, self.path)
+        write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
         self._file = self.path.open("a", encoding="utf-8")
         self._logger = logger
 

@@ -14,7 +14,7 @@ from fb3d_rl.assets import archive as module
 from fb3d_rl.assets.archive import unpack
 from fb3d_rl.contract import UserError
 
-NAMES = ("../out.txt", "/tmp/fb3d_absolute.txt", "a/../../out.txt", "..\\out.txt", "good/1/mobility.urdf")
+NAMES = ("../out.txt", "a/../../out.txt", "..\\out.txt", "good/1/mobility.urdf")
 
 
 def files(folder: Path) -> set[str]:
@@ -51,8 +51,9 @@ def test_good_archives_are_unpacked(tmp_path: Path) -> None:
 
 
 def test_nothing_of_a_zip_leaves_the_target(tmp_path: Path) -> None:
-    unpack(as_zip(tmp_path / "a.zip", NAMES), tmp_path / "below/out")
-    assert not Path("/tmp/fb3d_absolute.txt").exists()
+    absolute = tmp_path / "absolute.txt"
+    unpack(as_zip(tmp_path / "a.zip", (*NAMES, str(absolute))), tmp_path / "below/out")
+    assert not absolute.exists()
     assert {path.name for path in tmp_path.iterdir()} == {"a.zip", "below"}
     assert [path.name for path in (tmp_path / "below").iterdir()] == ["out"]
     assert "good/1/mobility.urdf" in files(tmp_path / "below/out")
@@ -93,7 +94,7 @@ def test_damaged_archives_end_in_one_sentence(tmp_path: Path) -> None:
 
 
 def test_what_does_not_fit_or_is_in_the_way_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = as_zip(tmp_path / "a.zip", NAMES)
+    path = as_zip(tmp_path / "a.zip", (*NAMES, "more.txt"))
     with pytest.raises(UserError, match="exists"):
         unpack(path, tmp_path)
     with pytest.raises(UserError, match="no file"):
