@@ -100,9 +100,13 @@ class ArtFlowNetConfig(AlgoConfig):
     rotate: bool
     mirror: bool
     scale: float
+    jitter: float
+    dropout: float
+    precision: str
     log_every: int
     evaluate_every: int | None
     checkpoint_every: int | None
+    backbone: str
     neighbors: int
     part_mask_input: bool
 
@@ -404,12 +408,16 @@ def validate(cfg: CommandConfig) -> None:
 
 def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
     _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
+    _one_of("algo.backbone", algo.backbone, ("pointnet2", "delayed"))
     for key in ("batch_size", "log_every", "neighbors"):
         _at_least(f"algo.{key}", getattr(algo, key), 1)
     if algo.ema is not None and not 0 < algo.ema < 1:
         raise UserError(f"algo.ema={algo.ema} is out of range; give a number between 0 and 1, or null")
-    if not 0 <= algo.scale < 1:
-        raise UserError(f"algo.scale={algo.scale} is out of range; give a number from 0 to below 1")
+    _one_of("algo.precision", algo.precision, ("fp32", "bf16"))
+    for key in ("scale", "dropout"):
+        if not 0 <= getattr(algo, key) < 1:
+            raise UserError(f"algo.{key}={getattr(algo, key)} is out of range; give a number from 0 to below 1")
+    _at_least("algo.jitter", algo.jitter, 0)
     for key in ("epochs", "lr"):
         _positive(f"algo.{key}", getattr(algo, key))
 

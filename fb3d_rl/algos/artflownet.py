@@ -119,7 +119,7 @@ def assist(cfg: TrainConfig, out: Path) -> None:
 def network_arguments(cfg: TrainConfig) -> dict[str, Any]:
     """The network's arguments."""
     algo = cast("ArtFlowNetConfig", cfg.algo)
-    return {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors}
+    return {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors, "backbone": algo.backbone}
 
 
 def best_cosine(path: Path) -> float:
@@ -149,6 +149,9 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
         rotate=algo.rotate,
         mirror=algo.mirror,
         scale=algo.scale,
+        jitter=algo.jitter,
+        dropout=algo.dropout,
+        precision=algo.precision,
         seed=cfg.seed,
         log_every=algo.log_every,
         evaluate_every=algo.evaluate_every,

@@ -19,8 +19,9 @@ from torch import Tensor, nn
 
 from fb3d_rl.contract import UserError
 from fb3d_rl.files import write_bytes
+from fb3d_rl.models.delayed import DelayedPointNet2
 from fb3d_rl.models.dense import initialize
-from fb3d_rl.models.pointnet2 import PointNet2
+from fb3d_rl.models.pointnet2 import PointNet2, PointwiseNet
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])
 
@@ -29,12 +30,14 @@ POINTS = 1200
 
 FORMAT = "fb3d_rl artflownet 1"
 
+BACKBONES: dict[str, type[PointwiseNet]] = {"pointnet2": PointNet2, "delayed": DelayedPointNet2}
+
 PRETRAINED = Path(__file__).resolve().parents[2] / "results" / "pretrained" / "artflownet.safetensors"
 """The weights that this project publishes."""
 
 
 class ArtFlowNet(nn.Module):
-    """Predict 3D articulation flow with PointNet++.
+    """Predict 3D articulation flow with a PointNet++.
 
     The network subtracts the mean of a cloud's valid points first and does not scale: its ball radii are
     metres. So its output does not change when the scene is moved, and it sees real sizes.
@@ -43,6 +46,8 @@ class ArtFlowNet(nn.Module):
         part_mask_input: feed the mask of the part to open as an input channel. Without it, the mask is
             ignored.
         neighbors: points kept in a ball. 64 is PointNet++'s; 32 is faster.
+        backbone: "pointnet2", the paper's, or "delayed", which is several times as fast
+            (:mod:`fb3d_rl.models.delayed`).
         generator: draws the first weights (on the CPU); None leaves them to torch's global generator.
 
     Shapes:
@@ -51,12 +56,16 @@ class ArtFlowNet(nn.Module):
     """
 
     def __init__(
-        self, part_mask_input: bool = True, neighbors: int = 64, generator: torch.Generator | None = None
+        self,
+        part_mask_input: bool = True,
+        neighbors: int = 64,
+        backbone: str = "pointnet2",
+        generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.part_mask_input = part_mask_input
-        self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors}
-        self.network = PointNet2(inputs=int(part_mask_input), outputs=3, neighbors=neighbors)
+        self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors, "backbone": backbone}
+        self.network = BACKBONES[backbone](inputs=int(part_mask_input), outputs=3, neighbors=neighbors)
         if generator is not None:
             initialize(self.network, generator)
 

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 
 from fb3d_rl.contract import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.delayed import DelayedPointNet2, PooledAbstraction
 from fb3d_rl.models.dense import DenseLayer, DenseMLP
-from fb3d_rl.models.pointnet2 import FeaturePropagation, SetAbstraction
+from fb3d_rl.models.pointnet2 import FeaturePropagation, PointNet2, SetAbstraction
 
 
 class DenseArtFlowNet(nn.Module):
@@ -28,10 +29,15 @@ class DenseArtFlowNet(nn.Module):
     def forward(self, points: Tensor, part_mask: Tensor) -> Tensor:
         """See the class."""
         network = self.net.network
+        assert isinstance(network, (PointNet2, DelayedPointNet2))
         points = points - points.mean(1, keepdim=True)
         own = part_mask[..., None].to(points.dtype) if self.net.part_mask_input else None
-        fine, points1 = _abstract(network.sa1, own, points)
-        middle, points2 = _abstract(network.sa2, fine, points1)
+        if isinstance(network, DelayedPointNet2):
+            own, fine, points1 = _pool(network.sa1, own, points)
+            _, middle, points2 = _pool(network.sa2, fine, points1)
+        else:
+            fine, points1 = _abstract(network.sa1, own, points)
+            middle, points2 = _abstract(network.sa2, fine, points1)
         whole = _layers(network.sa3.layers, torch.cat([middle, points2], -1)).amax(1, keepdim=True)
         middle = _layers(network.fp3.layers, torch.cat([whole.expand(-1, points2.shape[1], -1), middle], -1))
         fine = _propagate(network.fp2, middle, points2, fine, points1)
@@ -60,16 +66,30 @@ def export(net: ArtFlowNet, path: Path, points: int) -> None:
 
 def _abstract(layer: SetAbstraction, features: Tensor | None, points: Tensor) -> tuple[Tensor, Tensor]:
     """The set abstraction's features [B, M, C] and centres [B, M, 3]."""
+    centres, near = _balls(layer, points)
+    rows = _gather(points, near) - centres[:, :, None]
+    if features is not None:
+        rows = torch.cat([_gather(features, near), rows], -1)
+    return _layers(layer.layers, rows).amax(2), centres
+
+
+def _pool(layer: PooledAbstraction, features: Tensor | None, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The points' features [B, N, C], the centres' [B, M, C'] and the centres [B, M, 3]."""
+    own = _layers(layer.before, points if features is None else torch.cat([features, points], -1))
+    centres, near = _balls(layer, points)
+    rows = _gather(own, near), _gather(points, near) - centres[:, :, None]
+    best = _activate(layer.pooled, layer.pooled.linear(torch.cat(rows, -1)).amax(2))
+    return own, _layers(layer.after, best), centres
+
+
+def _balls(layer: SetAbstraction | PooledAbstraction, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Centres [B, M, 3] and the neighbours of each [B, M, K]."""
     centres = _gather(points, _farthest(points, math.ceil(points.shape[1] * layer.ratio)))
     # The first neighbours by index: the largest of falling numbers.
     inside = _squared(centres, points) <= layer.radius * layer.radius
     falling = torch.arange(points.shape[1], 0, -1, device=points.device)
     rank, near = torch.where(inside, falling, 0).topk(min(layer.neighbors, points.shape[1]))
-    near = torch.where(rank > 0, near, near[..., :1])  # a repeat changes no maximum
-    rows = _gather(points, near) - centres[:, :, None]
-    if features is not None:
-        rows = torch.cat([_gather(features, near), rows], -1)
-    return _layers(layer.layers, rows).amax(2), centres
+    return centres, torch.where(rank > 0, near, near[..., :1])  # a repeat changes no maximum
 
 
 def _propagate(
@@ -89,8 +109,12 @@ def _layers(layers: DenseMLP, rows: Tensor) -> Tensor:
 
 
 def _layer(layer: DenseLayer, rows: Tensor) -> Tensor:
+    return _activate(layer, layer.linear(rows))
+
+
+def _activate(layer: DenseLayer, rows: Tensor) -> Tensor:
     scale, shift = layer.fixed_norm()
-    return (layer.linear(rows) * scale + shift).relu()
+    return (rows * scale + shift).relu()
 
 
 def _farthest(points: Tensor, count: int) -> Tensor:

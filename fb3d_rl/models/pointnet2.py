@@ -92,11 +92,13 @@ class SetAbstraction(nn.Module):
         coarse, grouping = self.group(fine)
         first = next(iter(self.layers)).linear.weight
         place = first[:, self.inputs :]
-        of_points = fine.flat(fine.points) @ place.T
-        if features is not None:
-            of_points = of_points + features @ first[:, : self.inputs].T
-        of_centres = coarse.flat(coarse.points) @ place.T
-        return grouped_max(of_points, of_centres, grouping, self.layers), coarse
+        # In float32 under autocast, too, which would round places to some 4 mm.
+        with torch.autocast(fine.points.device.type, enabled=False):
+            of_points = fine.flat(fine.points) @ place.T
+            if features is not None:
+                of_points = of_points + features.to(place.dtype) @ first[:, : self.inputs].T
+            of_centres = coarse.flat(coarse.points) @ place.T
+            return grouped_max(of_points, of_centres, grouping, self.layers), coarse
 
 
 class GlobalAbstraction(nn.Module):
@@ -144,7 +146,8 @@ class FeaturePropagation(nn.Module):
             with torch.no_grad():
                 index, share = ops.three_nn(coarse.points, fine.points, coarse.valid)
                 index = coarse.row.gather(1, index.flatten(1)).view_as(index)
-            rows = functional.embedding_bag(fine.flat(index), rows, per_sample_weights=fine.flat(share), mode="sum")
+            share = fine.flat(share).to(rows.dtype)
+            rows = functional.embedding_bag(fine.flat(index), rows, per_sample_weights=share, mode="sum")
         if skip is not None:
             rows = rows + skip @ weight[:, self.inputs :].T
         rows = first.activate(rows)
@@ -153,8 +156,8 @@ class FeaturePropagation(nn.Module):
         return rows
 
 
-class PointNet2(nn.Module):
-    """PointNet++ with a vector of ``outputs`` numbers for each point.
+class PointwiseNet(nn.Module):
+    """A network with a vector of ``outputs`` numbers for each point.
 
     Args:
         inputs: feature channels of each point beside its position.
@@ -168,7 +171,30 @@ class PointNet2(nn.Module):
 
     def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
         super().__init__()
-        self.outputs = outputs
+        self.inputs, self.outputs, self.neighbors = inputs, outputs, neighbors
+
+    def rows(self, features: Tensor | None, cloud: Level) -> Tensor:
+        """Features [P, inputs] of the valid points -> [P, outputs]; P > 0."""
+        raise NotImplementedError
+
+    def forward(self, points: Tensor, valid: Tensor, features: Tensor | None = None) -> Tensor:
+        """See the class."""
+        cloud = Level.of(points, valid)
+        if cloud.total == 0:
+            return points.new_zeros(*valid.shape, self.outputs)
+        rows = self.rows(None if features is None else cloud.flat(features), cloud)
+        if cloud.total == valid.numel():
+            return rows.view(*valid.shape, -1)
+        output = rows.new_zeros(*valid.shape, self.outputs)
+        output[valid] = rows
+        return output
+
+
+class PointNet2(PointwiseNet):
+    """PointNet++ as in the paper; see the module and the class above."""
+
+    def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
+        super().__init__(inputs, outputs, neighbors)
         self.sa1 = SetAbstraction(inputs, (64, 64, 128), ratio=0.2, radius=0.2, neighbors=neighbors)
         self.sa2 = SetAbstraction(128, (128, 128, 256), ratio=0.25, radius=0.4, neighbors=neighbors)
         self.sa3 = GlobalAbstraction(256, (256, 512, 1024))
@@ -177,20 +203,12 @@ class PointNet2(nn.Module):
         self.fp1 = FeaturePropagation(128, inputs, (128, 128, 128))
         self.head = nn.Sequential(DenseMLP(128, 128, 128), nn.Linear(128, outputs))
 
-    def forward(self, points: Tensor, valid: Tensor, features: Tensor | None = None) -> Tensor:
-        """See the class."""
-        level0 = Level.of(points, valid)
-        if level0.total == 0:
-            return points.new_zeros(*valid.shape, self.outputs)
-        own = None if features is None else level0.flat(features)
-        fine, level1 = self.sa1(own, level0)
+    def rows(self, features: Tensor | None, cloud: Level) -> Tensor:
+        """See the base class."""
+        fine, level1 = self.sa1(features, cloud)
         middle, level2 = self.sa2(fine, level1)
         whole = self.sa3(middle, level2)
         middle = self.fp3(whole, None, middle, level2)
         fine = self.fp2(middle, level2, fine, level1)
-        rows = self.head(self.fp1(fine, level1, own, level0))
-        if level0.total == valid.numel():
-            return rows.view(*valid.shape, -1)
-        output = rows.new_zeros(*valid.shape, self.outputs)
-        output[valid] = rows
-        return output
+        rows: Tensor = self.head(self.fp1(fine, level1, features, cloud))
+        return rows

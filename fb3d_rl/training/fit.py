@@ -21,7 +21,7 @@ from typing import Any, Protocol, TypeAlias
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, distributed, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
@@ -44,6 +44,8 @@ class Rows(Protocol):
 
 SCHEDULES = ("constant", "one_cycle")
 
+PRECISIONS = ("fp32", "bf16")
+
 
 @dataclass(frozen=True)
 class FitOptions:
@@ -61,6 +63,10 @@ class FitOptions:
         mirror: reflect every other drawn cloud and its flow, at random, in the plane y = 0: a left-hinged door becomes
             a right-hinged one.
         scale: multiply every drawn cloud by a random factor from 1 - scale to 1 + scale.
+        jitter: standard deviation of noise on every drawn point, m; the flow stays.
+        dropout: take up to this share of its points, drawn for every cloud, out of it.
+        precision: "fp32", or "bf16": a flow network's products in bfloat16 (autocast), its weights, places and the rest
+            in float32.
         seed: of the rows drawn and of the rotations.
         log_every: steps from one log row to the next.
         evaluate_every: steps from one evaluation to the next; None only at the end.
@@ -77,6 +83,9 @@ class FitOptions:
     rotate: bool = True
     mirror: bool = False
     scale: float = 0.0
+    jitter: float = 0.0
+    dropout: float = 0.0
+    precision: str = "fp32"
     seed: int = 0
     log_every: int = 10
     evaluate_every: int | None = None
@@ -91,6 +100,8 @@ class FitOptions:
         """
         if self.schedule not in SCHEDULES:
             raise UserError(f"schedule={self.schedule} is unknown: choose one of {', '.join(SCHEDULES)}.")
+        if self.precision not in PRECISIONS:
+            raise UserError(f"precision={self.precision} is unknown: choose one of {', '.join(PRECISIONS)}.")
         for name in ("steps", "batch_size", "lr", "log_every", "evaluate_every", "checkpoint_every", "clip_norm"):
             value = getattr(self, name)
             if value is not None and value <= 0:
@@ -145,30 +156,51 @@ def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
 
 
 def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
-    """:func:`flow_loss` of a flow network on clouds that are turned, mirrored and scaled as the options say.
+    """:func:`flow_loss` of a flow network on clouds that are augmented as the options say.
 
     ``share`` is the part of the whole batch that the objective is given.
     """
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
-        points, flow = batch["observation", "points"], batch["privileged", "flow"]
-        valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
-        device = points.device
-        if options.rotate:
-            angle = torch.rand(options.batch_size, generator=generator(options.seed, 2, step))[share]
-            angle = angle.to(device) * (2 * math.pi)
-            points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
-        if options.mirror or options.scale:
-            draws = torch.rand(2, options.batch_size, 1, 1, generator=generator(options.seed, 3, step))[:, share]
-            draws = draws.to(device)
-            if options.mirror:
-                reflect = torch.ones_like(points[:, :1])
-                reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
-                points, flow = points * reflect, flow * reflect
-            points = points * (1 + options.scale * (2 * draws[1] - 1))
-        return flow_loss(model(points, valid, part_mask), flow, valid)
+        batch = augment(batch, options, step, share)
+        points, valid = batch["observation", "points"], batch["observation", "valid"]
+        with torch.autocast(points.device.type, torch.bfloat16, enabled=options.precision == "bf16"):
+            predicted = model(points, valid, batch["observation", "part_mask"])
+        return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
 
     return objective
+
+
+def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice = slice(None)) -> TensorDictBase:
+    """The flow samples of a batch, turned, mirrored, scaled, jittered and thinned out as the options say.
+
+    What is drawn depends on the seed and the step alone, for the whole batch, whose part ``share`` is given.
+    """
+    points, flow = batch["observation", "points"], batch["privileged", "flow"]
+    valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]
+    size, device = options.batch_size, points.device
+
+    def draw(purpose: int, *shape: int, normal: bool = False) -> Tensor:
+        random = torch.randn if normal else torch.rand
+        return random(size, *shape, generator=generator(options.seed, purpose, step))[share].to(device)
+
+    if options.rotate:
+        angle = draw(2) * (2 * math.pi)
+        points, flow = rotate_about_z(points, angle), rotate_about_z(flow, angle)
+    if options.mirror or options.scale:
+        draws = torch.rand(2, size, 1, 1, generator=generator(options.seed, 3, step))[:, share].to(device)
+        if options.mirror:
+            reflect = torch.ones_like(points[:, :1])
+            reflect[..., 1] = torch.where(draws[0, ..., 0] < 0.5, -1.0, 1.0)
+            points, flow = points * reflect, flow * reflect
+        points = points * (1 + options.scale * (2 * draws[1] - 1))
+    if options.jitter:
+        points = points + options.jitter * draw(4, points.shape[1], 3, normal=True)
+    if options.dropout:
+        valid = valid & (draw(5, points.shape[1]) >= options.dropout * draw(6, 1))
+        part_mask, flow = part_mask & valid, flow * valid[..., None]
+    observation = {"points": points, "valid": valid, "part_mask": part_mask}
+    return TensorDict({"observation": observation, "privileged": {"flow": flow}}, batch_size=batch.batch_size)
 
 
 def rotate_about_z(vectors: Tensor, angle: Tensor) -> Tensor:
@@ -369,12 +401,14 @@ def fit(
 
 def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:
     """Refuse to continue a run under options that would have led elsewhere."""
-    decisive = ["batch_size", "lr", "schedule", "clip_norm", "ema", "rotate", "mirror", "scale", "seed"]
+    decisive = ["batch_size", "lr", "schedule", "clip_norm", "ema", "rotate", "mirror", "scale", "jitter", "dropout"]
+    decisive += ["precision", "seed"]
     if options.schedule != "constant":
         decisive.append("steps")
     for name in decisive:
-        if before.get(name) != getattr(options, name):
+        trained_with = before.get(name, getattr(FitOptions, name, None))  # older checkpoints lack what came later
+        if trained_with != getattr(options, name):
             raise UserError(
-                f"The checkpoint was trained with {name}={before.get(name)}, not {getattr(options, name)}: "
+                f"The checkpoint was trained with {name}={trained_with}, not {getattr(options, name)}: "
                 f"resume with the same value or start a new run."
             )

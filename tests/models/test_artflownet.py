@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -8,17 +10,25 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, artflownet_module
+from fb3d_rl.models.artflownet import BACKBONES, POINTS, ArtFlowNet, artflownet_module
+
+Maker: TypeAlias = "Callable[..., ArtFlowNet]"
 
 
-def make_net(part_mask_input: bool = True) -> ArtFlowNet:
-    """A network whose batch norms have seen data."""
-    net = ArtFlowNet(part_mask_input, neighbors=16, generator=torch.Generator().manual_seed(0))
-    for module in net.modules():
-        if isinstance(module, torch.nn.BatchNorm1d):
-            module.momentum = 1.0  # take the statistics of one batch as they are
-    net(*make_batch(1))
-    return net
+@pytest.fixture(params=list(BACKBONES))
+def make_net(request: pytest.FixtureRequest) -> Maker:
+    """Makes networks, of each kind, whose batch norms have seen data."""
+
+    def make(part_mask_input: bool = True, neighbors: int = 16) -> ArtFlowNet:
+        generator = torch.Generator().manual_seed(0)
+        net = ArtFlowNet(part_mask_input, neighbors, request.param, generator)
+        for module in net.modules():
+            if isinstance(module, torch.nn.BatchNorm1d):
+                module.momentum = 1.0  # take the statistics of one batch as they are
+        net(*make_batch(1))
+        return net
+
+    return make
 
 
 def make_batch(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -29,7 +39,7 @@ def make_batch(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @pytest.mark.parametrize("training", [False, True])
-def test_padding_changes_nothing(training: bool) -> None:
+def test_padding_changes_nothing(make_net: Maker, training: bool) -> None:
     net = make_net().train(training)
     points, valid, mask = make_batch()
     clean = points.masked_fill(~valid[..., None], 0.0)
@@ -43,7 +53,7 @@ def test_padding_changes_nothing(training: bool) -> None:
     assert expected[valid].abs().min() > 0
 
 
-def test_moving_the_scene_changes_nothing_but_scaling_does() -> None:
+def test_moving_the_scene_changes_nothing_but_scaling_does(make_net: Maker) -> None:
     net = make_net().eval()
     points, valid, mask = make_batch()
     expected = net(points, valid, mask)
@@ -52,7 +62,17 @@ def test_moving_the_scene_changes_nothing_but_scaling_does() -> None:
     assert not torch.allclose(net(points * 1.5, valid, mask), expected, atol=1e-2)
 
 
-def test_clouds_of_a_batch_do_not_mix_in_evaluation() -> None:
+def test_order_of_points_changes_nothing(make_net: Maker) -> None:
+    """Balls here are never overfull. The first point stays where it is: sampling starts there."""
+    net = make_net(neighbors=80).eval()
+    points, valid, mask = make_batch()
+    valid[:, 0] = True
+    order = torch.cat([torch.zeros(1, dtype=torch.int64), 1 + torch.randperm(79)])
+    mixed = net(points[:, order], valid[:, order], mask[:, order])
+    torch.testing.assert_close(mixed, net(points, valid, mask)[:, order], atol=1e-4, rtol=1e-4)
+
+
+def test_clouds_of_a_batch_do_not_mix_in_evaluation(make_net: Maker) -> None:
     net = make_net().eval()
     points, valid, mask = make_batch()
     together = net(points, valid, mask)
@@ -60,14 +80,14 @@ def test_clouds_of_a_batch_do_not_mix_in_evaluation() -> None:
     torch.testing.assert_close(alone, together, atol=1e-4, rtol=1e-4)
 
 
-def test_part_mask_is_read_only_if_asked_for() -> None:
+def test_part_mask_is_read_only_if_asked_for(make_net: Maker) -> None:
     points, valid, mask = make_batch()
     for used in (True, False):
         net = make_net(part_mask_input=used).eval()
         assert torch.equal(net(points, valid, mask), net(points, valid, ~mask)) is not used
 
 
-def test_empty_clouds_give_zeros() -> None:
+def test_empty_clouds_give_zeros(make_net: Maker) -> None:
     points, valid, mask = make_batch()
     valid[1] = False
     for net in (make_net().train(), make_net().eval()):
@@ -77,7 +97,7 @@ def test_empty_clouds_give_zeros() -> None:
         assert net(points, torch.zeros_like(valid), mask).abs().max() == 0
 
 
-def test_every_parameter_learns_and_module_has_the_contract_keys() -> None:
+def test_every_parameter_learns_and_module_has_the_contract_keys(make_net: Maker) -> None:
     module = artflownet_module(make_net())
     points, valid, mask = make_batch()
     td = TensorDict({"observation": {"points": points, "valid": valid, "part_mask": mask}}, batch_size=[3])
@@ -101,7 +121,7 @@ def test_widths_are_those_of_pointnet2() -> None:
     ]  # fmt: skip
 
 
-def test_a_small_cloud_is_predicted_as_it_is() -> None:
+def test_a_small_cloud_is_predicted_as_it_is(make_net: Maker) -> None:
     net = make_net()
     points, valid, mask = make_batch()
     expected = net.eval()(points[:1], valid[:1], mask[:1])[0].detach()
@@ -116,7 +136,7 @@ def test_a_small_cloud_is_predicted_as_it_is() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, POINTS, POINTS + 1, 3000])
-def test_a_cloud_of_any_size_gets_a_flow_for_each_point(count: int) -> None:
+def test_a_cloud_of_any_size_gets_a_flow_for_each_point(make_net: Maker, count: int) -> None:
     net = make_net()
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(1))
     mask = points[:, 2] > 0.5
@@ -125,7 +145,7 @@ def test_a_cloud_of_any_size_gets_a_flow_for_each_point(count: int) -> None:
     assert (flow.norm(dim=1) > 0).all()
 
 
-def test_a_large_cloud_gets_what_its_parts_would() -> None:
+def test_a_large_cloud_gets_what_its_parts_would(make_net: Maker) -> None:
     """Dealt out at random, so that the flow of a point hardly depends on the cloud's size."""
     net = make_net()
     few = torch.rand(POINTS, 3, generator=torch.Generator().manual_seed(1))
@@ -139,13 +159,13 @@ def test_a_large_cloud_gets_what_its_parts_would() -> None:
     [((5, 2), torch.ones(5), "cloud"), ((2, 5, 3), torch.ones(5), "cloud"), ((5, 3), torch.ones(4), "mask"),
      ((5, 3), None, "part_mask")],
 )  # fmt: skip
-def test_wrong_shapes_are_named(shape: tuple[int, ...], mask: torch.Tensor | None, word: str) -> None:
+def test_wrong_shapes_are_named(make_net: Maker, shape: tuple[int, ...], mask: torch.Tensor | None, word: str) -> None:
     with pytest.raises(UserError, match=word):
         make_net().predict(torch.zeros(shape), mask)
     assert make_net(part_mask_input=False).predict(torch.rand(5, 3)).shape == (5, 3)
 
 
-def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
+def test_weights_come_back_as_they_were(make_net: Maker, tmp_path: Path) -> None:
     net = make_net().eval()
     net.save_pretrained(tmp_path / "net.safetensors", {"command": "python launch/train.py"})
     again = ArtFlowNet.from_pretrained(tmp_path / "net.safetensors")
@@ -155,7 +175,7 @@ def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "text", "pickle", "other", "missing"])
-def test_damaged_weights_end_in_one_sentence(tmp_path: Path, damage: str) -> None:
+def test_damaged_weights_end_in_one_sentence(make_net: Maker, tmp_path: Path, damage: str) -> None:
     path = tmp_path / "net.safetensors"
     make_net().save_pretrained(path)
     content = bytearray(path.read_bytes())

@@ -8,13 +8,18 @@ import pytest
 import torch
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.artflownet import BACKBONES, ArtFlowNet
 from fb3d_rl.models.export import DenseArtFlowNet, export
 
 
-def trained(part_mask_input: bool = True) -> ArtFlowNet:
-    """A network whose batch norms have seen data and whose flow is of the size of 1."""
-    net = ArtFlowNet(part_mask_input, neighbors=16, generator=torch.Generator().manual_seed(0))
+def trained(part_mask_input: bool = True, backbone: str = "pointnet2") -> ArtFlowNet:
+    """A network whose batch norms have seen data, some with a negative scale, and whose flow is of the size of 1."""
+    generator = torch.Generator().manual_seed(0)
+    net = ArtFlowNet(part_mask_input, neighbors=16, backbone=backbone, generator=generator)
+    for module in net.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            with torch.no_grad():
+                module.weight[::3] *= -1
     for _ in range(20):
         net(*cloud(0))
     with torch.no_grad():
@@ -29,8 +34,9 @@ def cloud(seed: int, batch: int = 2, points: int = 300) -> tuple[torch.Tensor, t
 
 
 @pytest.mark.parametrize("part_mask_input", [True, False])
-def test_fast_and_dense_network_are_equal(part_mask_input: bool) -> None:
-    net = trained(part_mask_input)
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_fast_and_dense_network_are_equal(part_mask_input: bool, backbone: str) -> None:
+    net = trained(part_mask_input, backbone)
     points, valid, mask = cloud(1)
     torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), net(points, valid, mask), atol=1e-4, rtol=1e-4)
     net, points = net.double(), points.double()  # where no rounding hides a difference
@@ -39,8 +45,9 @@ def test_fast_and_dense_network_are_equal(part_mask_input: bool) -> None:
     torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), expected, atol=1e-10, rtol=1e-10)
 
 
-def test_the_exported_program_equals_the_network(tmp_path: Path) -> None:
-    net, path = trained(), tmp_path / "net.pt2"
+@pytest.mark.parametrize("backbone", BACKBONES)
+def test_the_exported_program_equals_the_network(tmp_path: Path, backbone: str) -> None:
+    net, path = trained(backbone=backbone), tmp_path / "net.pt2"
     export(net, path, 300)
     program = torch.export.load(path).module()
     for seed, batch in ((1, 1), (2, 5)):
