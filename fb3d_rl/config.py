@@ -47,6 +47,7 @@ class DataConfig:
 
     Attributes:
         train_samples: samples to train ArtFlowNet on.
+        dataset: the folder samples/ of another run, to train on what it drew; null draws anew.
         labels: control steps that the expert labels for imitation, in all rounds.
         eval_samples: samples per held-out object on which the flow is measured.
         workers: worker processes; null for one per core.
@@ -54,6 +55,7 @@ class DataConfig:
 
     points: int
     train_samples: int
+    dataset: str | None
     labels: int
     eval_samples: int
     workers: int | None

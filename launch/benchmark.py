@@ -2,6 +2,7 @@
 
 python launch/benchmark.py                        steps, labels, workers, reading, loading, a soak test
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
+python launch/benchmark.py network --peer DIR     ArtFlowNet's training against PyTorch Geometric's, installed in DIR
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak")
+BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak", "network")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,6 +27,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--split", default="all", help="which of them: a split, a category, ids (default: all)")
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each comparison (default: 5)")
     parser.add_argument("--steps", type=int, default=10000, help="steps of the soak test (default: 10000)")
+    parser.add_argument("--peer", type=Path, help="folder for the packages that 'network' compares with")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="of 'network' (default: cpu)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("results/runs/benchmark.json"), help="JSON file to write")
     options = parser.parse_args(arguments)
@@ -43,9 +46,8 @@ def run(options: argparse.Namespace) -> None:
     from fb3d_rl.assets.catalog import find_objects
     from fb3d_rl.contract import UserError
     from fb3d_rl.data.samples import SampleOptions
-    from fb3d_rl.env.options import EnvOptions
-    from fb3d_rl.evaluation import benchmark
-    from fb3d_rl.evaluation.trials import schedule
+    from fb3d_rl.evaluation.network_speed import draw_clouds, install_peer, network_speed
+    from fb3d_rl.evaluation.tables import number_rows
     from fb3d_rl.files import write_text
     from fb3d_rl.flow.opening import openable_links
     from fb3d_rl.training.checkpoint import git_revision
@@ -59,10 +61,21 @@ def run(options: argparse.Namespace) -> None:
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())
-    env, rounds = EnvOptions(), options.rounds
+    rounds = options.rounds
     results: dict[str, Any] = {}
     with console.status("starting") as status:
         for name in options.names or BENCHMARKS:
+            if name == "network":  # needs no simulator
+                if options.peer:
+                    install_peer(options.peer, status.update)
+                clouds = draw_clouds(objects, 64, options.seed)
+                results[name] = network_speed(clouds, (64, 16), rounds, options.peer, options.device, status.update)
+                continue
+            from fb3d_rl.env.options import EnvOptions
+            from fb3d_rl.evaluation import benchmark
+            from fb3d_rl.evaluation.trials import schedule
+
+            env = EnvOptions()
             if name == "steps":
                 results[name] = benchmark.step_rates(by_category[:6], env, rounds, status.update)
             elif name == "labelling":
@@ -88,7 +101,7 @@ def run(options: argparse.Namespace) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     write_text(options.out, json.dumps(about | results, indent=1) + "\n")
     table = Table("benchmark", "measured", "value", box=None)
-    for row in benchmark.rows(results):
+    for row in number_rows(results):
         table.add_row(*row)
     console.print(table)
     console.print(f"wrote {options.out}")

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
+from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.training.run_log import RunLog, read_rows
 
@@ -97,6 +98,15 @@ def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path, config
     run(config("train", [*SMALL, "resume=true"]), tmp_path)
     assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+
+
+def test_a_kept_data_set_gives_the_same_run(first: Path, tmp_path: Path, config: Config) -> None:
+    own = [*SMALL, "evaluation.trials=0", "assets.train_count=1", "data.train_samples=1"]  # neither matters then
+    run(config("train", [*own, f"data.dataset={first / 'samples'}"]), tmp_path)
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
+    assert not (tmp_path / "samples").exists()
+    with pytest.raises(UserError, match="no finished flow samples"):
+        run(config("train", [*own, f"data.dataset={first}"]), tmp_path / "other")
 
 
 @pytest.mark.slow

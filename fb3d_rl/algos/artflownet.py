@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
 from fb3d_rl.contract import UserError, check
-from fb3d_rl.data.generate import generate_samples
+from fb3d_rl.data.generate import generate_samples, load_samples
+from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.evaluation.evaluate import evaluate
 from fb3d_rl.evaluation.flow import held_out_samples, predict
 from fb3d_rl.evaluation.rows import TrialRow
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
     from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, TrainConfig
 
 CHECKPOINT = "checkpoint.pt"
+
+SAMPLES = "samples"
+"""The run's data set; data.dataset gives it to another run."""
 
 BEST = "best.safetensors"
 """The weights of the run that did best in validation."""
@@ -52,23 +56,13 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
+    kept = load_samples(Path(cfg.data.dataset)) if cfg.data.dataset else None
     options = fit_options(cfg)
     samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)
 
-    columns = (TextColumn("flow samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns) as bar:
-        task = bar.add_task("", total=cfg.data.train_samples)
-        rows = generate_samples(
-            out / "samples",
-            [entry.folder for entry in train],
-            cfg.data.train_samples,
-            cfg.seed,
-            samples,
-            setup.workers(cfg.data.workers),
-            lambda done: bar.update(task, completed=done),
-        )
+    rows = draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES) if kept is None else kept
     check(rows, "sample")
     wait_for_all()
     buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
@@ -112,8 +106,19 @@ def assist(cfg: TrainConfig, out: Path) -> None:
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     net = new_network(cfg.seed, **network_arguments(cfg))
     wait_for_all()
-    buffer = TensorDictReplayBuffer(storage=TensorStorage(TensorDict.load_memmap(out / "samples" / "rows")))
+    buffer = TensorDictReplayBuffer(storage=TensorStorage(load_samples(Path(cfg.data.dataset or out / SAMPLES))))
     fit(net, buffer, options, device=device, resume=resume["state"] if resume else None, progress=False)
+
+
+def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> TensorDictBase:
+    """Draw the flow samples to train on, with a progress bar."""
+    columns = (TextColumn("flow samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    count, workers = cfg.data.train_samples, setup.workers(cfg.data.workers)
+    with Progress(*columns) as bar:
+        task = bar.add_task("", total=count)
+        return generate_samples(
+            out, folders, count, cfg.seed, samples, workers, lambda done: bar.update(task, completed=done)
+        )
 
 
 def network_arguments(cfg: TrainConfig) -> dict[str, Any]:
@@ -139,8 +144,9 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     algo, processes = cast("ArtFlowNetConfig", cfg.algo), rank_and_count()[1]
     if algo.batch_size % processes:
         raise UserError(f"algo.batch_size={algo.batch_size} cannot be shared out to {processes} processes equally")
+    rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
     return FitOptions(
-        steps=math.ceil(algo.epochs * cfg.data.train_samples / algo.batch_size),
+        steps=math.ceil(algo.epochs * rows / algo.batch_size),
         batch_size=algo.batch_size,
         lr=algo.lr,
         schedule=algo.schedule,

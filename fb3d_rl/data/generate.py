@@ -98,6 +98,17 @@ def generate_samples(
     return rows
 
 
+def load_samples(folder: Path) -> TensorDictBase:
+    """The finished data set that :func:`generate_samples` left in a folder, as rows [S] on disk.
+
+    Raises:
+        UserError: there is none.
+    """
+    if not (folder / DONE).is_file():
+        raise UserError(f"{folder} holds no finished flow samples; give the samples/ of a run of algo=artflownet")
+    return TensorDict.load_memmap(folder / "rows")
+
+
 def _quiet() -> None:
     torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
 

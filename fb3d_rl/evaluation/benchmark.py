@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -341,13 +341,3 @@ def soak(
         "memory, MB": resident[1] / 1e6,
         "memory after / before": resident[1] / resident[0],
     }
-
-
-def rows(results: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:
-    """(benchmark, what, value) of each number, for a table."""
-    for name, numbers in results.items():
-        for key, value in numbers.items():
-            if isinstance(value, float):
-                yield name, key, f"{value:.3g}" if value < 100 else f"{value:.0f}"
-            elif not isinstance(value, list):
-                yield name, key, str(value)

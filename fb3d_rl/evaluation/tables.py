@@ -19,7 +19,7 @@ Intervals
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -355,3 +355,13 @@ def show(numbers: Mapping[str, Any], console: Console | None = None) -> None:
         console.width = max(console.width, 100)
     for table in tables(numbers):
         console.print(table)
+
+
+def number_rows(results: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:
+    """(benchmark, what, value) of each number, for a table."""
+    for name, numbers in results.items():
+        for key, value in numbers.items():
+            if isinstance(value, float):
+                yield name, key, f"{value:.3g}" if value < 100 else f"{value:.0f}"
+            elif not isinstance(value, list):
+                yield name, key, str(value)

@@ -9,7 +9,7 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow
-from fb3d_rl.evaluation.tables import means, show, summary, wilson
+from fb3d_rl.evaluation.tables import means, number_rows, show, summary, wilson
 
 
 def trial(category: str, object_: str, success: bool, contact: bool = True, **changes: object) -> TrialRow:
@@ -178,3 +178,8 @@ def test_the_terminals_table_has_every_category_and_fits() -> None:
     ):
         assert any(word in line for line in lines), word
     assert not any("…" in line for line in lines)
+
+
+def test_a_table_of_benchmarks_has_every_number() -> None:
+    rows = list(number_rows({"steps": {"a": 1234.5, "b": 0.5123, "objects": ["x"], "c": "not measured"}}))
+    assert rows == [("steps", "a", "1234"), ("steps", "b", "0.512"), ("steps", "c", "not measured")]
