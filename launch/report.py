@@ -3,6 +3,7 @@
 python launch/report.py RUN              writes RUN/report.html
 python launch/report.py RUN RUN [...]    writes comparison.html and comparison.csv next to the runs
 python launch/report.py SWEEP            compares all runs below a folder, such as a sweep's, and writes there
+python launch/report.py --paper RUN      sets an evaluation on PartNet-Mobility beside what is published: RUN/paper.md
 """
 
 from __future__ import annotations
@@ -26,14 +27,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="HTML file to write (default: RUN/report.html, or comparison.html in the folder or next to the runs); "
         "a comparison's numbers go beside it as .csv",
     )
+    parser.add_argument("--paper", action="store_true", help="set one run beside what is published, as Markdown")
+    parser.add_argument(
+        "--variant",
+        default="mask",
+        choices=("mask", "no_mask", "no_mask_vpa"),
+        help="with --paper: the published network to compare with (default: mask)",
+    )
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
     from fb3d_rl.contract import UserError
-    from fb3d_rl.evaluation import comparison, report, runs, tables
+    from fb3d_rl.evaluation import comparison, published, report, runs, tables
+    from fb3d_rl.files import write_text
 
     folders: list[Path] = options.runs
     try:
-        if len(folders) == 1 and runs.is_run(folders[0]):
+        if options.paper:
+            if len(folders) != 1:
+                raise UserError("--paper sets one run beside what is published; give one run folder")
+            page = published.paper(runs.read_run(folders[0]), options.variant)
+            path = options.out or folders[0] / "paper.md"
+            write_text(path, page)
+        elif len(folders) == 1 and runs.is_run(folders[0]):
             path = report.write_report(folders[0], options.out)
             tables.show(runs.read_run(folders[0]).summary)
         else:

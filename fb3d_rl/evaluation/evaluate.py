@@ -67,8 +67,8 @@ def evaluate(
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
-    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, clouds.npz and flow.png, with
-    ``protocol.videos`` also videos/, and prints the table.
+    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, flow_rows_all_parts.csv, clouds.npz
+    and flow.png, with ``protocol.videos`` also videos/, and prints the table.
 
     Args:
         out: the run folder.
@@ -145,10 +145,9 @@ def _measure_flow(
             if protocol.clouds:
                 _keep_clouds(out / "clouds.npz", samples, predicted, about, protocol.clouds)
             continue
+        write_flow(out / "flow_rows_all_parts.csv", rows)
         everything = summary([], rows)
-        extra["flow_all_parts"] = {
-            key: value for key, value in everything.items() if key.startswith("flow/") or key == "by_split"
-        }
+        extra["flow_all_parts"] = {key: value for key, value in everything.items() if key.startswith(("flow/", "by_"))}
     return measured, extra
 
 

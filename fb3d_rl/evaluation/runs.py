@@ -22,7 +22,15 @@ from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_flow, read_trials
 
 CLOUD_ARRAYS = ("points", "valid", "part_mask", "flow_true", "flow_predicted", "title")
 
-_FILES = ("config.yaml", "metrics.jsonl", "rows.csv", "flow_rows.csv", "summary.json", "clouds.npz")
+_FILES = (
+    "config.yaml",
+    "metrics.jsonl",
+    "rows.csv",
+    "flow_rows.csv",
+    "flow_rows_all_parts.csv",
+    "summary.json",
+    "clouds.npz",
+)
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,7 @@ class Run:
     log: list[dict[str, Any]]
     rows: list[TrialRow]
     flow: list[FlowRow]
+    flow_all_parts: list[FlowRow]
     summary: dict[str, Any]
     clouds: dict[str, NDArray[Any]] | None
 
@@ -93,6 +102,7 @@ def read_run(path: Path) -> Run:
         log=_read_log(path / "metrics.jsonl") if has["metrics.jsonl"] else [],
         rows=rows,
         flow=flow,
+        flow_all_parts=read_flow(path / "flow_rows_all_parts.csv") if has["flow_rows_all_parts.csv"] else [],
         summary=_read_summary(path / "summary.json") if has["summary.json"] else tables.summary(rows, flow),
         clouds=_read_clouds(path / "clouds.npz") if has["clouds.npz"] else None,
     )

@@ -191,8 +191,9 @@ def test_joints_open_outwards(objects: list[tuple[Path, Link, list[Link]]]) -> N
             elif "WashingMachine" in path.name and np.abs(link.axis[1]) < 0.5:  # a lid on top
                 assert way[1] > 0.01, path.name
             elif "-Door-" in path.name:  # to the front or inward, all leaves alike
-                first = movable[0].moved(np.concatenate([m.vertices for m in movable[0].meshes]), 0.2).mean(0)[2]
-                assert abs(way[2]) > 0.01 and (way[2] > 0) == (first > 0), path.name
+                first = np.concatenate([mesh.vertices for mesh in movable[0].meshes])
+                ahead = (movable[0].moved(first, 0.2) - first).mean(0)[2] > 0
+                assert abs(way[2]) > 0.01 and (way[2] > 0) == ahead, path.name
             else:
                 assert way[1 if upwards else 2] > 0.01, (path.name, name)
 

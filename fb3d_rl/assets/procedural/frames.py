@@ -18,12 +18,14 @@ from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, housing,
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 
-def frame(name: str, x: Range, y: Range, z: Range, bar: float, sill: bool) -> list[Piece]:
-    """Upright and upper bars of width `bar` (m) inside the outline x, y, with a lower bar if `sill`."""
+def frame(name: str, x: Range, y: Range, z: Range, bar: float, sill: bool, head: float | None = None) -> list[Piece]:
+    """Upright bars of width `bar` (m) and an upper one of height `head` (`bar` unless given) inside the outline x, y,
+    with a lower bar if `sill`.
+    """
     pieces = [
         box(name, (x[0], x[0] + bar), y, z),
         box(name, (x[1] - bar, x[1]), y, z),
-        box(name, (x[0] + bar, x[1] - bar), (y[1] - bar, y[1]), z),
+        box(name, (x[0] + bar, x[1] - bar), (y[1] - (bar if head is None else head), y[1]), z),
     ]
     if sill:
         pieces.append(box(name, (x[0] + bar, x[1] - bar), (y[0], y[0] + bar), z))
@@ -31,14 +33,20 @@ def frame(name: str, x: Range, y: Range, z: Range, bar: float, sill: bool) -> li
 
 
 def door(rng: np.random.Generator) -> ObjectSpec:
-    """A frame with one leaf, or two that meet in the middle; they open to the front or, where there is room, inward."""
+    """A frame, or a piece of wall, with one leaf or two that meet in the middle; they open to the front or, where there
+    is room, inward.
+    """
     double = rng.random() < 0.35
     width, height = rng.uniform(0.6, 0.95) * (1.6 if double else 1.0), rng.uniform(1.3, 1.8)
     scale = 1.97 / float(np.hypot(width, height))
     x, y = (-width * scale / 2, width * scale / 2), (0.0, height * scale)
-    bar, deep = rng.uniform(0.03, 0.08), rng.uniform(0.05, 0.12)
-    sill = bool(rng.random() < 0.3)
-    body = frame("door_frame", x, y, (-deep, 0.0), bar, sill)
+    if rng.random() < 0.35:
+        bar, head = rng.uniform(0.08, 0.2) * (x[1] - x[0]), rng.uniform(0.08, 0.3) * (y[1] - y[0])
+        deep, sill = rng.uniform(0.08, 0.25), False
+    else:
+        bar, deep = rng.uniform(0.03, 0.08), rng.uniform(0.05, 0.12)
+        head, sill = bar, bool(rng.random() < 0.3)
+    body = frame("door_frame", x, y, (-deep, 0.0), bar, sill, head)
     thickness = min(rng.uniform(0.03, 0.05), deep)
     style = FrontStyle(
         draw_handle(rng, bare=0.0),
@@ -49,7 +57,7 @@ def door(rng: np.random.Generator) -> ObjectSpec:
     )
     inner = x[1] - x[0] - 2 * bar
     gap = rng.uniform(0.0045, 0.006) + swing_room(inner / (2 if double else 1), thickness)
-    leaf_y = (y[0] + (bar + gap if sill else gap), y[1] - bar - gap)
+    leaf_y = (y[0] + (bar + gap if sill else gap), y[1] - head - gap)
     left, right = x[0] + bar + gap, x[1] - bar - gap
     leaves: list[tuple[Range, Side]]
     if double:

@@ -1,0 +1,72 @@
+"""The page beside the published numbers holds every category of both sides, with numbers that follow from the rows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation.published import PUBLISHED, paper
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.runs import read_run
+
+
+def flow(category: str, object_: str, cosine: float, rmse: float, split: str = "test") -> FlowRow:
+    return FlowRow(object_, category, split, "*", cosine, rmse, 0.1)
+
+
+def cells(page: str, name: str) -> list[str]:
+    (line,) = [line for line in page.splitlines() if line.startswith(f"| {name} |")]
+    return [cell.strip() for cell in line.strip("|").split("|")][1:]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    rows = [flow("Box", "1", 0.9, 0.1), flow("Box", "1", 0.7, 0.3), flow("Box", "2", 1.0, 0.0)]
+    rows += [flow("Safe", "3", 0.2, 0.5), flow("Laptop", "4", 0.99, 0.02, "train_test")]
+    write_flow(tmp_path / "flow_rows_all_parts.csv", rows)
+    trials = [
+        TrialRow(i, "artflownet", obj, category, split, "link_0", "lid", "hinge", 0, success=won, contact=True)
+        for i, (obj, category, split, won) in enumerate(
+            [("1", "Box", "test", True), ("2", "Box", "test", False), ("3", "Safe", "test", True),
+             ("4", "Laptop", "train_test", True)]
+        )
+    ]  # fmt: skip
+    write_trials(tmp_path / "rows.csv", trials)
+    return tmp_path
+
+
+def test_every_cell_follows_from_the_rows(run: Path) -> None:
+    page = paper(read_run(run), "mask")
+    test = page[page.index("## Flow, test") :]
+    box = cells(test, "Box")
+    assert box[:2] == ["2", "13"]  # objects of ours, of UMPNet's list
+    assert box[2].startswith("**0.900**") and box[3] == "0.808"  # each object counts once
+    assert box[4].startswith("**0.100**") and box[5] == "0.220"
+    safe = cells(test, "Safe")
+    assert safe[2].startswith("0.200") and safe[3].startswith("**")
+    assert cells(test, "Oven")[0] == "0" and cells(test, "Oven")[2] == "–"
+    instance, mean = cells(test, "**instance mean**"), cells(test, "**class mean**")
+    assert instance[:2] == ["3", "261"]
+    assert instance[2].startswith("0.667") and instance[3] == "**0.816**"
+    assert mean[2].startswith("0.550") and mean[3] == "**0.783**"
+    of_train = page[page.index("## Flow, train_test") : page.index("## Flow, test")]
+    assert cells(of_train, "**instance mean**")[1] == "132"
+    for split in ("train_test", "test"):
+        for category in PUBLISHED["flow"]["values"][split]["mask"]:
+            assert category in page
+
+
+def test_success_is_beside_what_is_published(run: Path) -> None:
+    page = paper(read_run(run), "no_mask")
+    assert "| published: FlowBotHD | | 88.2 % | 93.7 % | 80.5 % | 86.3 % |" in page
+    (own,) = [line for line in page.splitlines() if line.startswith("| artflownet |")]
+    assert "4, 4 trials" in own and "83.3 %" in own and "75.0 %" in own and "66.7 %" in own
+    assert "11 of" in page  # the supplement's slips
+
+
+def test_a_run_on_other_objects_is_refused(tmp_path: Path) -> None:
+    write_flow(tmp_path / "flow_rows_all_parts.csv", [flow("Box", "1", 0.9, 0.1, "all")])
+    with pytest.raises(UserError, match="train_test"):
+        paper(read_run(tmp_path), "mask")
