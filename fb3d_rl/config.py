@@ -48,6 +48,8 @@ class DataConfig:
     Attributes:
         train_samples: samples to train ArtFlowNet on.
         dataset: the folder samples/ of another run, to train on what it drew; null draws anew.
+        met_by: an ArtFlowNet whose policy runs trials with the training objects; what it sees there is trained on, too.
+        met_samples: how many such clouds.
         labels: control steps that the expert labels for imitation, in all rounds.
         eval_samples: samples per held-out object on which the flow is measured.
         workers: worker processes; null for one per core.
@@ -56,6 +58,8 @@ class DataConfig:
     points: int
     train_samples: int
     dataset: str | None
+    met_by: str | None
+    met_samples: int
     labels: int
     eval_samples: int
     workers: int | None
@@ -91,6 +95,7 @@ class ArtFlowNetConfig(AlgoConfig):
 
     Attributes:
         epochs: how often each training sample is drawn; with the batch size it gives the number of steps.
+        start_from: the weights to start from, a checkpoint.pt or .safetensors; null draws them.
     """
 
     epochs: float
@@ -108,6 +113,7 @@ class ArtFlowNetConfig(AlgoConfig):
     log_every: int
     evaluate_every: int | None
     checkpoint_every: int | None
+    start_from: str | None
     backbone: str
     neighbors: int
     part_mask_input: bool
@@ -372,6 +378,7 @@ def validate(cfg: CommandConfig) -> None:
         elif isinstance(cfg.algo, ImitationConfig):
             _validate_imitation(cfg.algo, cfg.collector, cfg.data.labels)
         _at_least("data.train_samples", cfg.data.train_samples, 1)
+        _at_least("data.met_samples", cfg.data.met_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
     if isinstance(cfg, EvaluateConfig) and cfg.policy.name != "expert" and not cfg.checkpoint:
         raise UserError(f"policy={cfg.policy.name} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")

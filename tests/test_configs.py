@@ -158,7 +158,9 @@ PAIRS: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "data/default": ((SampleOptions(),), ()),
     "collector/direct": ((CollectorOptions(),), ()),
 }
-ONLY_CONFIGURED = {"data/default": {"train_samples", "dataset", "labels", "eval_samples", "workers"}}
+ONLY_CONFIGURED = {
+    "data/default": {"train_samples", "dataset", "met_by", "met_samples", "labels", "eval_samples", "workers"}
+}
 
 
 @pytest.mark.parametrize("name", PAIRS)

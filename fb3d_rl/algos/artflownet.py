@@ -12,13 +12,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from safetensors import safe_open
 from tensordict import TensorDictBase
 from torch import nn
-from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
+from fb3d_rl.algos.aggregation import meet_samples
 from fb3d_rl.contract import UserError, check
-from fb3d_rl.data.generate import generate_samples, load_samples
+from fb3d_rl.data.generate import Joined, generate_samples, load_samples
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.evaluation.evaluate import evaluate
+from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.flow import held_out_samples, predict
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
@@ -36,6 +36,9 @@ CHECKPOINT = "checkpoint.pt"
 
 SAMPLES = "samples"
 """The run's data set; data.dataset gives it to another run."""
+
+MET = "met"
+"""The clouds that the policy of data.met_by met."""
 
 BEST = "best.safetensors"
 """The weights of the run that did best in validation."""
@@ -57,19 +60,27 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
     kept = load_samples(Path(cfg.data.dataset)) if cfg.data.dataset else None
-    options = fit_options(cfg)
+    options, net = fit_options(cfg), new_network(cfg)
+    met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
+    if met_by is not None:
+        setup.require_simulator()
     samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)
 
     rows = draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES) if kept is None else kept
     check(rows, "sample")
+    if met_by is not None:
+        loaded, count = [entry.load() for entry in train], cfg.data.met_samples
+        acting = artflownet_policy(met_by, limits, speeds)
+        made_by = {"weights": met_by.digest(), "policy": asdict(speeds)}
+        with progress_bars() as bar:
+            task = bar.add_task("clouds met", total=count)
+            meet_samples(out / MET, loaded, acting, count, protocol, made_by, lambda n: bar.update(task, completed=n))
     wait_for_all()
-    buffer = TensorDictReplayBuffer(storage=TensorStorage(rows))
+    buffer = training_rows(cfg, out)
     validation, about = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
     split_of_row = [split for _, split, _ in about]
-
-    net = new_network(cfg.seed, **network_arguments(cfg))
 
     def validate(measured: nn.Module) -> dict[str, float]:
         """On all held-out objects, and on those of each split where there are several."""
@@ -104,10 +115,11 @@ def assist(cfg: TrainConfig, out: Path) -> None:
     """Fit beside the first of several processes, which does all the rest, once the samples are there."""
     device, options = setup.choose_device(cfg.device), fit_options(cfg)
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
-    net = new_network(cfg.seed, **network_arguments(cfg))
+    net = new_network(cfg)
     wait_for_all()
-    buffer = TensorDictReplayBuffer(storage=TensorStorage(load_samples(Path(cfg.data.dataset or out / SAMPLES))))
-    fit(net, buffer, options, device=device, resume=resume["state"] if resume else None, progress=False)
+    fit(
+        net, training_rows(cfg, out), options, device=device, resume=resume["state"] if resume else None, progress=False
+    )
 
 
 def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> TensorDictBase:
@@ -121,10 +133,10 @@ def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, 
         )
 
 
-def network_arguments(cfg: TrainConfig) -> dict[str, Any]:
-    """The network's arguments."""
-    algo = cast("ArtFlowNetConfig", cfg.algo)
-    return {"part_mask_input": algo.part_mask_input, "neighbors": algo.neighbors, "backbone": algo.backbone}
+def training_rows(cfg: TrainConfig, out: Path) -> Joined:
+    """What is trained on: flow samples, and behind them what a policy met."""
+    folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
+    return Joined(*map(load_samples, folders))
 
 
 def best_cosine(path: Path) -> float:
@@ -145,6 +157,7 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     if algo.batch_size % processes:
         raise UserError(f"algo.batch_size={algo.batch_size} cannot be shared out to {processes} processes equally")
     rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
+    rows += cfg.data.met_samples if cfg.data.met_by else 0
     return FitOptions(
         steps=math.ceil(algo.epochs * rows / algo.batch_size),
         batch_size=algo.batch_size,
@@ -165,9 +178,22 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     )
 
 
-def new_network(seed: int, **kwargs: Any) -> ArtFlowNet:
-    """A network with initial weights that depend on the seed alone."""
-    return ArtFlowNet(**kwargs, generator=torch.Generator().manual_seed(seed))
+def new_network(cfg: TrainConfig) -> ArtFlowNet:
+    """The network to train: its weights depend on the seed alone, or are those of ``algo.start_from``.
+
+    Raises:
+        UserError: these are another network's.
+    """
+    algo = cast("ArtFlowNetConfig", cfg.algo)
+    generator = torch.Generator().manual_seed(cfg.seed)
+    net = ArtFlowNet(algo.part_mask_input, algo.neighbors, algo.backbone, generator)
+    if algo.start_from:
+        begun = load_network(algo.start_from)
+        if begun.arguments != net.arguments:
+            different = [f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments[key] != value]
+            raise UserError(f"algo.start_from={algo.start_from} is another network; give {' '.join(different)}")
+        net.load_state_dict(begun.state_dict())
+    return net
 
 
 def load_network(path: str | Path) -> ArtFlowNet:

@@ -7,11 +7,12 @@ import multiprocessing
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -63,14 +64,11 @@ def generate_samples(
         "options": asdict(options),
         "version": 1,
     }
-    recipe = json.loads(json.dumps(recipe))
-    done_file = out / DONE
-    if done_file.is_file() and json.loads(done_file.read_text())["recipe"] == recipe:
+    done = finished_rows(out, recipe)
+    if done is not None:
         progress(count)
-        return TensorDict.load_memmap(out / "rows")
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
-    _empty_rows(count, options.points).memmap_like(out / "rows")
+        return done
+    empty_rows(out, count, options.points)
     owner = np.random.default_rng([seed, 0]).permutation(count) % len(folders)
     jobs = [(out / "rows", folder, f, np.flatnonzero(owner == f), seed, options) for f, folder in enumerate(folders)]
     missing: list[int] = []
@@ -94,8 +92,40 @@ def generate_samples(
                 raise
     rows = TensorDict.load_memmap(out / "rows")
     _refill(rows, sorted(missing), count)
-    write_text(done_file, json.dumps({"recipe": recipe, "refilled": len(missing)}))
+    finish(out, recipe, refilled=len(missing))
     return rows
+
+
+def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:
+    """The rows of the finished data set in a folder, if they were made by this recipe."""
+    done = out / DONE
+    if done.is_file() and json.loads(done.read_text())["recipe"] == json.loads(json.dumps(recipe)):
+        return TensorDict.load_memmap(out / "rows")
+    return None
+
+
+def finish(out: Path, recipe: Mapping[str, Any], **facts: int) -> None:
+    """Write down that the data set in a folder is whole, and how it was made."""
+    write_text(out / DONE, json.dumps({"recipe": recipe, **facts}))
+
+
+class Joined:
+    """The rows of several data sets, one after the other."""
+
+    def __init__(self, *parts: TensorDictBase) -> None:
+        self.parts = parts
+        self.starts = torch.tensor([0, *(len(part) for part in parts)]).cumsum(0)
+
+    def __len__(self) -> int:
+        return int(self.starts[-1])
+
+    def __getitem__(self, index: torch.Tensor) -> TensorDictBase:
+        """Rows [B] by their numbers [B], in that order."""
+        owner = torch.searchsorted(self.starts, index, right=True) - 1
+        order = owner.argsort(stable=True)
+        taken = [part[index[owner == k] - self.starts[k]] for k, part in enumerate(self.parts)]
+        rows: TensorDictBase = torch.cat(taken)[order.argsort()]
+        return rows
 
 
 def load_samples(folder: Path) -> TensorDictBase:
@@ -126,22 +156,25 @@ def _no_interrupt() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
 
 
-def _empty_rows(count: int, points: int) -> TensorDict:
-    n = points
+def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:
+    """A memory map of ``count`` rows of zeros in an emptied folder, and what else is in there gone."""
     row = TensorDict(
         {
             "observation": {
-                "points": torch.zeros(n, 3),
-                "valid": torch.zeros(n, dtype=torch.bool),
-                "part_mask": torch.zeros(n, dtype=torch.bool),
+                "points": torch.zeros(points, 3),
+                "valid": torch.zeros(points, dtype=torch.bool),
+                "part_mask": torch.zeros(points, dtype=torch.bool),
             },
-            "privileged": {"flow": torch.zeros(n, 3)},
+            "privileged": {"flow": torch.zeros(points, 3)},
             "target": torch.zeros((), dtype=torch.int64),
             "object": torch.zeros((), dtype=torch.int64),
         },
         batch_size=[],
     )
-    return row.expand(count)
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    rows: TensorDictBase = row.expand(count).memmap_like(out / "rows")
+    return rows
 
 
 def _draw_object(

@@ -4,6 +4,7 @@ supplement, II.A).
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -128,6 +129,11 @@ class ArtFlowNet(nn.Module):
         if isinstance(points, Tensor):
             return flow.to(points.device)
         return flow.cpu().numpy()
+
+    def digest(self) -> str:
+        """SHA-256 of weights and statistics."""
+        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
+        return hashlib.sha256(save(tensors)).hexdigest()
 
     def save_pretrained(self, path: str | Path, about: Mapping[str, str] | None = None) -> None:
         """Write weights and arguments as one safetensors file, in one step.

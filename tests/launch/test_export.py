@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from fb3d_rl.algos.artflownet import load_network, new_network
+from fb3d_rl.algos.artflownet import load_network
+from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.training.checkpoint import save_checkpoint
 from launch.export import main
 
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    net = new_network(0, neighbors=8)
+    net = ArtFlowNet(neighbors=8, generator=torch.Generator().manual_seed(0))
     path = tmp_path / "run" / "checkpoint.pt"
     state = {"step": 3, "model": net.state_dict()}
     save_checkpoint(path, algo="artflownet", config={"seed": 0}, model_kwargs=net.arguments, state=state, seed=0)

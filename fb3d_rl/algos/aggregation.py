@@ -1,0 +1,97 @@
+"""Clouds that a network's own policy meets while it acts, labelled with the true flow: DAgger for the flow network.
+
+They show what samples of an object alone do not: the hand in front of it, and parts that stand half open where that
+policy left them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.contract import Key, UserError
+from fb3d_rl.data.generate import empty_rows, finish, finished_rows
+from fb3d_rl.data.samples import ObjectView
+from fb3d_rl.env.workers import CollectorOptions, Workers
+from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.rollout import create_env, state_of
+from fb3d_rl.evaluation.trials import draw_trials
+
+EVERY = 4
+"""Frames from one that is kept to the next: a fifth of a second apart, neighbours are nearly alike."""
+
+KEYS: tuple[Key, ...] = (
+    *(("observation", key) for key in ("points", "valid", "part_mask")),
+    ("privileged", "flow"),
+)
+
+
+def meet_samples(
+    out: Path,
+    objects: Sequence[ArticulatedObject],
+    policy: TensorDictModuleBase,
+    count: int,
+    protocol: Protocol,
+    made_by: dict[str, Any],
+    progress: Callable[[int], None] = lambda done: None,
+) -> TensorDictBase:
+    """Run trials with a policy and keep every few frames in which something visible moves, until there are ``count``.
+
+    Args:
+        out: folder of the memory map; a finished one that was made from the same arguments is reused.
+        objects: the objects to train on; a trial's category, object and part are drawn with equal odds.
+        policy: acts.
+        count: number of samples S.
+        protocol: clouds, task, workers and seed.
+        made_by: what else decides the samples, such as the policy's weights; kept in the folder.
+        progress: called with the number of samples so far.
+
+    Returns:
+        TensorDict [S] as :func:`fb3d_rl.data.generate.generate_samples` gives it.
+
+    Raises:
+        UserError: all trials of a batch crashed, or showed nothing that moves.
+    """
+    recipe = {"objects": [obj.id for obj in objects], "count": count, "seed": protocol.seed, "made_by": made_by,
+              "samples": asdict(protocol.samples), "env": asdict(protocol.env)}  # fmt: skip
+    done = finished_rows(out, recipe)
+    if done is not None:
+        progress(count)
+        return done
+    rows = empty_rows(out, count, protocol.samples.points)
+    views = [ObjectView(obj, protocol.samples.camera) for obj in objects]
+    number = {obj.id: index for index, obj in enumerate(objects)}
+    rng = np.random.default_rng([protocol.seed, 6])
+    create = partial(create_env, tuple(objects), protocol.env, state_of(policy))
+    filled = 0
+    with Workers(create, policy, protocol.collector or CollectorOptions(), protocol.env.horizon) as workers:
+        while filled < count:
+            trials = draw_trials(views, protocol.samples, rng, min(24, 1 + (count - filled) // 10))
+            frames = {episode.index: episode.frames for episode in workers.run(trials, KEYS)}
+            before = filled
+            for index, trial in enumerate(trials):  # in this order, whichever ended first
+                episode = frames[index]
+                if episode is None:
+                    continue
+                seen = episode[::EVERY]
+                seen = seen[seen["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5][: count - filled]
+                part = slice(filled, filled + len(seen))
+                numbers = {"target": trial.link, "object": number[trial.object]}
+                rows[part] = seen.select(*KEYS).update(
+                    {key: torch.full([len(seen)], value) for key, value in numbers.items()}
+                )
+                filled = part.stop
+            if filled == before:
+                raise UserError("none of the trials in which clouds were to be met showed a part that moves")
+            progress(filled)
+    finish(out, recipe)
+    return rows
