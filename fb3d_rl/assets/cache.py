@@ -24,7 +24,7 @@ import trimesh
 from fb3d_rl.assets.articulation import Joint, Link, Mesh
 from fb3d_rl.files import write_bytes
 
-VERSION = 1
+VERSION = 2
 """Of what is kept and of the reader that makes it; raise it with either."""
 
 DIGEST = hashlib.sha256().digest_size

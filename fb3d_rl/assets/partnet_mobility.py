@@ -125,6 +125,19 @@ def _bound(folder: Path, *texts: Path) -> None:
             )
 
 
+def _each_once(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The same surface without repeats.
+
+    PartNet's files hold a point for each corner and triangles for each side; a fifth of the points and half of the
+    triangles are left.
+    """
+    first, number = trimesh.grouping.unique_rows(vertices, keep_order=True)
+    faces = number[faces]
+    return vertices[first], faces[np.sort(trimesh.grouping.unique_rows(np.sort(faces, axis=1))[0])]
+
+
 class _Reader:
     """Reads the parts of one URDF; holds the meshes read so far, since visuals and collisions share them."""
 
@@ -132,7 +145,7 @@ class _Reader:
         self.folder = folder
         self.urdf = urdf
         self.files: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        self.placed: dict[tuple[str, bytes, bytes], Mesh] = {}
+        self.placed: dict[tuple[str, bytes, bytes, bool], Mesh] = {}
         self.dropped: list[str] = []
 
     def parse(self) -> Element:
@@ -278,18 +291,28 @@ class _Reader:
                 self.dropped.append(f"a {tag} of {link.get('name')}: no mesh")
                 continue
             filename = self.attribute(mesh, "filename")
-            placed = self.place(filename, self.numbers(mesh.get("scale"), 3, 1.0), self.origin(element))
+            placed = self.place(
+                filename, self.numbers(mesh.get("scale"), 3, 1.0), self.origin(element), tag == "visual"
+            )
             if tag == "collision" and self.urdf.name == DECOMPOSED:
                 meshes += self.pieces(placed)
             elif len(placed.faces):
                 meshes.append(placed)
         return tuple(meshes)
 
-    def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64]) -> Mesh:
-        """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments."""
-        key = (filename, scale.tobytes(), transform.tobytes())
+    def place(
+        self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool = False
+    ) -> Mesh:
+        """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.
+
+        ``seen``: it is only looked at, so that each point and triangle is enough once. What collides stays as it is:
+        for PhysX a triangle has one side.
+        """
+        key = (filename, scale.tobytes(), transform.tobytes(), seen)
         if key not in self.placed:
             vertices, faces = self.mesh(filename)
+            if seen and len(faces):
+                vertices, faces = _each_once(vertices, faces)
             with np.errstate(over="ignore", invalid="ignore"):
                 moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
             if len(faces) and not abs(moved).max() <= FARTHEST:

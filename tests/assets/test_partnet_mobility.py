@@ -111,6 +111,17 @@ def test_meshes_stand_in_their_links_frame(tmp_path: Path) -> None:
     np.testing.assert_array_equal(visual.faces, [[0, 1, 2], [0, 2, 3]])
 
 
+def test_what_is_looked_at_has_each_point_and_triangle_once(tmp_path: Path) -> None:
+    """As in the dataset: a point for each corner, and triangles for both sides."""
+    mesh = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 0\nv 0 2 0\nv 0 0 3\nf 1 2 3\nf 4 5 6\nf 3 2 1\nf 1 3 6\n"
+    door = next(item for item in load_object(write(tmp_path, mesh=mesh)).links if item.name == "door")
+    (seen,), (touched,) = door.visuals, door.collisions
+    assert (len(seen.vertices), len(seen.faces)) == (4, 2)
+    assert (len(touched.vertices), len(touched.faces)) == (6, 4)  # for PhysX a triangle has one side
+    np.testing.assert_array_equal(seen.vertices[seen.faces], touched.vertices[touched.faces[:2]])
+    np.testing.assert_array_equal(seen.vertices.max(0), touched.vertices.max(0))
+
+
 def test_flaws_that_do_no_harm_are_named_and_dropped(tmp_path: Path) -> None:
     urdf = GOOD.replace('<limit lower="-0.5" upper="1.25"/>', '<limit lower="1" upper="-1"/>')
     urdf = urdf.replace('<limit lower="0" upper="0.1"/>', "")

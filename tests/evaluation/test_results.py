@@ -21,9 +21,7 @@ def differing(computed: object, kept: object, where: str = "") -> list[str]:
     if isinstance(computed, dict) and isinstance(kept, dict):
         return [found for key in computed for found in differing(computed[key], kept.get(key), f"{where} {key}")]
     numbers = isinstance(computed, (float, list)) and kept is not None
-    same = (
-        kept == pytest.approx(computed, rel=1e-9) if numbers else kept == computed
-    )  # to rounding
+    same = kept == pytest.approx(computed, rel=1e-9) if numbers else kept == computed  # to rounding
     return [] if same else [f"{where}: {computed} {kept}"]
 
 
