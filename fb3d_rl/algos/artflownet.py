@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import safe_open
 from tensordict import TensorDictBase
 from torch import nn
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import meet_samples
@@ -117,17 +117,15 @@ def assist(cfg: TrainConfig, out: Path) -> None:
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     net = new_network(cfg)
     wait_for_all()
-    fit(
-        net, training_rows(cfg, out), options, device=device, resume=resume["state"] if resume else None, progress=False
-    )
+    rows, state = training_rows(cfg, out), resume["state"] if resume else None
+    fit(net, rows, options, device=device, resume=state, progress=False)
 
 
 def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> TensorDictBase:
     """Draw the flow samples to train on, with a progress bar."""
-    columns = (TextColumn("flow samples"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     count, workers = cfg.data.train_samples, setup.workers(cfg.data.workers)
-    with Progress(*columns) as bar:
-        task = bar.add_task("", total=count)
+    with progress_bars() as bar:
+        task = bar.add_task("flow samples", total=count)
         return generate_samples(
             out, folders, count, cfg.seed, samples, workers, lambda done: bar.update(task, completed=done)
         )
@@ -136,7 +134,7 @@ def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, 
 def training_rows(cfg: TrainConfig, out: Path) -> Joined:
     """What is trained on: flow samples, and behind them what a policy met."""
     folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
-    return Joined(*map(load_samples, folders))
+    return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(load_samples(folder))) for folder in folders))
 
 
 def best_cosine(path: Path) -> float:

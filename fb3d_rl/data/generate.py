@@ -12,7 +12,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.files import write_text
+
+if TYPE_CHECKING:  # takes seconds, which every worker process would wait
+    from torchrl.data import ReplayBuffer
 
 DONE = "samples.json"
 
@@ -110,9 +113,9 @@ def finish(out: Path, recipe: Mapping[str, Any], **facts: int) -> None:
 
 
 class Joined:
-    """The rows of several data sets, one after the other."""
+    """The rows of several replay buffers, one after the other."""
 
-    def __init__(self, *parts: TensorDictBase) -> None:
+    def __init__(self, *parts: ReplayBuffer) -> None:
         self.parts = parts
         self.starts = torch.tensor([0, *(len(part) for part in parts)]).cumsum(0)
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -54,7 +54,7 @@ def network_speed(
     """
     names = [f"{backbone} {precision}" for backbone in BACKBONES for precision in PRECISIONS]
     if peer is not None:
-        # With the two settings of the process that our training makes, and as it comes.
+        # As it comes, and with the two settings of the process that our training makes.
         names += ["peer", "peer tuned"]
     results: dict[str, Any] = {}
     with TemporaryDirectory() as folder:
@@ -133,7 +133,7 @@ class _Contenders:
         for name in names:
             path = os.pathsep.join(entry for entry in (*sys.path, str(peer or "")) if entry)
             self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", __name__, name, str(clouds), device],
+                [sys.executable, "-m", __name__, name, str(clouds), "cpu" if name.startswith("peer") else device],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path},
             )  # fmt: skip
 
@@ -185,6 +185,15 @@ def _loss(net: nn.Module, clouds: TensorDictBase, precision: str) -> Tensor:
     return flow_loss(predicted.float(), clouds["privileged", "flow"], valid)
 
 
+def _peak_memory() -> int:
+    """The most memory, bytes, that this process ever held."""
+    if sys.platform == "win32":
+        return int(psutil.Process().memory_info().peak_wset)
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
 def main() -> None:
     """A contender: reads lines "batch steps" and answers each."""
     name, folder, device = sys.argv[1:]
@@ -210,8 +219,7 @@ def main() -> None:
         if device == "cuda":
             torch.cuda.synchronize()
         seconds = (time.perf_counter() - start) / steps
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-        print(json.dumps({"seconds": seconds, "peak": peak}), flush=True)
+        print(json.dumps({"seconds": seconds, "peak": _peak_memory()}), flush=True)
 
 
 if __name__ == "__main__":
