@@ -1,6 +1,6 @@
 """Measure throughput as ratios in one run on the same work; prints a table and writes JSON.
 
-python launch/benchmark.py                        steps, labels, workers, reading, loading, a soak test
+python launch/benchmark.py                        steps, labels, workers, reading, loading, a soak test, networks
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
 python launch/benchmark.py network --peer DIR     ArtFlowNet's training against PyTorch Geometric's, installed in DIR
 """
@@ -46,8 +46,11 @@ def run(options: argparse.Namespace) -> None:
     from fb3d_rl.assets.catalog import find_objects
     from fb3d_rl.contract import UserError
     from fb3d_rl.data.samples import SampleOptions
+    from fb3d_rl.env.options import EnvOptions
+    from fb3d_rl.evaluation import benchmark
     from fb3d_rl.evaluation.network_speed import draw_clouds, install_peer, network_speed
     from fb3d_rl.evaluation.tables import number_rows
+    from fb3d_rl.evaluation.trials import schedule
     from fb3d_rl.files import write_text
     from fb3d_rl.flow.opening import openable_links
     from fb3d_rl.training.checkpoint import git_revision
@@ -61,21 +64,10 @@ def run(options: argparse.Namespace) -> None:
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())
-    rounds = options.rounds
+    env, rounds = EnvOptions(), options.rounds
     results: dict[str, Any] = {}
     with console.status("starting") as status:
         for name in options.names or BENCHMARKS:
-            if name == "network":  # needs no simulator
-                if options.peer:
-                    install_peer(options.peer, status.update)
-                clouds = draw_clouds(objects, 64, options.seed)
-                results[name] = network_speed(clouds, (64, 16), rounds, options.peer, options.device, status.update)
-                continue
-            from fb3d_rl.env.options import EnvOptions
-            from fb3d_rl.evaluation import benchmark
-            from fb3d_rl.evaluation.trials import schedule
-
-            env = EnvOptions()
             if name == "steps":
                 results[name] = benchmark.step_rates(by_category[:6], env, rounds, status.update)
             elif name == "labelling":
@@ -88,6 +80,11 @@ def run(options: argparse.Namespace) -> None:
                     results[name] = {"not measured": "give --root"}
                     continue
                 results[name] = benchmark.reading([obj.urdf.parent for obj in objects], status.update)
+            elif name == "network":
+                if options.peer:
+                    install_peer(options.peer, status.update)
+                clouds = draw_clouds(objects, 64, options.seed)
+                results[name] = network_speed(clouds, (64, 16), rounds, options.peer, options.device, status.update)
             elif name == "loading":
                 results[name] = benchmark.loading(objects, env, status.update)
             else:

@@ -21,7 +21,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.generate import empty_rows, finish, finished_rows
 from fb3d_rl.data.samples import ObjectView
-from fb3d_rl.env.workers import CollectorOptions, Workers
+from fb3d_rl.env.workers import Workers
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.rollout import create_env, state_of
 from fb3d_rl.evaluation.trials import draw_trials
@@ -73,7 +73,7 @@ def meet_samples(
     rng = np.random.default_rng([protocol.seed, 6])
     create = partial(create_env, tuple(objects), protocol.env, state_of(policy))
     filled = 0
-    with Workers(create, policy, protocol.collector or CollectorOptions(), protocol.env.horizon) as workers:
+    with Workers(create, policy, protocol.collector, protocol.env.horizon) as workers:
         while filled < count:
             trials = draw_trials(views, protocol.samples, rng, min(24, 1 + (count - filled) // 10))
             frames = {episode.index: episode.frames for episode in workers.run(trials, KEYS)}
@@ -85,9 +85,9 @@ def meet_samples(
                 seen = episode[::EVERY]
                 seen = seen[seen["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5][: count - filled]
                 part = slice(filled, filled + len(seen))
-                numbers = {"target": trial.link, "object": number[trial.object]}
+                owner, size = number[trial.object], [len(seen)]
                 rows[part] = seen.select(*KEYS).update(
-                    {key: torch.full([len(seen)], value) for key, value in numbers.items()}
+                    {"target": torch.full(size, trial.link), "object": torch.full(size, owner)}
                 )
                 filled = part.stop
             if filled == before:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from safetensors import safe_open
-from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
@@ -59,7 +58,6 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
-    kept = load_samples(Path(cfg.data.dataset)) if cfg.data.dataset else None
     options, net = fit_options(cfg), new_network(cfg)
     met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
     if met_by is not None:
@@ -68,8 +66,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)
 
-    rows = draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES) if kept is None else kept
-    check(rows, "sample")
+    if not cfg.data.dataset:
+        draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES)
     if met_by is not None:
         loaded, count = [entry.load() for entry in train], cfg.data.met_samples
         acting = artflownet_policy(met_by, limits, speeds)
@@ -121,20 +119,21 @@ def assist(cfg: TrainConfig, out: Path) -> None:
     fit(net, rows, options, device=device, resume=state, progress=False)
 
 
-def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> TensorDictBase:
+def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> None:
     """Draw the flow samples to train on, with a progress bar."""
     count, workers = cfg.data.train_samples, setup.workers(cfg.data.workers)
     with progress_bars() as bar:
         task = bar.add_task("flow samples", total=count)
-        return generate_samples(
-            out, folders, count, cfg.seed, samples, workers, lambda done: bar.update(task, completed=done)
-        )
+        generate_samples(out, folders, count, cfg.seed, samples, workers, lambda n: bar.update(task, completed=n))
 
 
 def training_rows(cfg: TrainConfig, out: Path) -> Joined:
     """What is trained on: flow samples, and behind them what a policy met."""
     folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
-    return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(load_samples(folder))) for folder in folders))
+    parts = [load_samples(folder) for folder in folders]
+    for part in parts:
+        check(part, "sample")
+    return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(part)) for part in parts))
 
 
 def best_cosine(path: Path) -> float:

@@ -300,9 +300,7 @@ class _Reader:
                 meshes.append(placed)
         return tuple(meshes)
 
-    def place(
-        self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool = False
-    ) -> Mesh:
+    def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool) -> Mesh:
         """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.
 
         ``seen``: it is only looked at, so that each point and triangle is enough once. What collides stays as it is:

@@ -52,10 +52,10 @@ def network_speed(
         device: "cpu" or "cuda", of ours.
         progress: is told what is being done.
     """
-    names = [f"{backbone} {precision}" for backbone in BACKBONES for precision in PRECISIONS]
-    if peer is not None:
-        # As it comes, and with the two settings of the process that our training makes.
-        names += ["peer", "peer tuned"]
+    own = [f"{backbone} {precision}" for backbone in BACKBONES for precision in PRECISIONS]
+    # The peer as it comes, and with the two settings of the process that our training makes.
+    peers = [] if peer is None else ["peer", "peer tuned"]
+    names = own + peers
     results: dict[str, Any] = {}
     with TemporaryDirectory() as folder:
         clouds.memmap(folder)
@@ -73,16 +73,19 @@ def network_speed(
             for name in names:
                 results[f"{name}, B={batch}, clouds/s"] = batch / min(seconds[name])
                 results[f"{name}, B={batch}, peak memory, GiB"] = memory[name] / 2**30
-                for other in ("peer", "peer tuned") if peer is not None and "peer" not in name else ():
+            for name in own:
+                for other in peers:
                     pairs = zip(seconds[other], seconds[name], strict=True)
-                    results[f"{name} / {other}, B={batch}"] = median(theirs / own for theirs, own in pairs)
-    for name in names:
-        if "peer" not in name and device == "cpu":
+                    results[f"{name} / {other}, B={batch}"] = median(theirs / ours for theirs, ours in pairs)
+    if device == "cpu":
+        first = batches[0]
+        products = {backbone: _products(backbone, clouds[:first]) for backbone in BACKBONES}
+        ceilings = {precision: _ceiling(precision) for precision in PRECISIONS}
+        for name in own:
             backbone, precision = name.split()
-            products = _products(backbone, clouds[: batches[0]]) / _ceiling(precision)
-            results[f"{name}, B={batches[0]}, share of time that its products need"] = products / (
-                batches[0] / results[f"{name}, B={batches[0]}, clouds/s"]
-            )
+            needed = products[backbone] / ceilings[precision]
+            taken = first / results[f"{name}, B={first}, clouds/s"]
+            results[f"{name}, B={first}, share of time that its products need"] = needed / taken
     return results
 
 
@@ -95,7 +98,7 @@ def draw_clouds(objects: Sequence[ArticulatedObject], count: int, seed: int) -> 
     options = SampleOptions()
     views = [ObjectView(obj, options.camera) for obj in objects[:count]]
     samples: list[TensorDictBase] = []
-    for number in range(4 * count):
+    for number in range(4 * count if views else 0):
         sample = draw_sample(views[number % len(views)], options, np.random.default_rng([seed, number]))
         if sample is not None:
             samples.append(sample)

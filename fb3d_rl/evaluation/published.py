@@ -12,12 +12,9 @@ from fb3d_rl.assets.splits import UMPNET_SPLIT
 from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, policies
 from fb3d_rl.evaluation.runs import Run
-from fb3d_rl.evaluation.tables import FLOW, SUCCESS, Means, Metric, measure
+from fb3d_rl.evaluation.tables import FLOW, SUCCESS, Interval, Means, Metric, measure
 
 PUBLISHED: dict[str, Any] = json.loads(Path(__file__).with_name("published.json").read_text())
-
-VARIANTS = ("mask", "no_mask", "no_mask_vpa")
-"""With the mask of what moves; without; without and with viewpoint augmentation."""
 
 SPLITS = {"train_test": "new objects of the training categories", "test": "unseen categories"}
 
@@ -32,7 +29,8 @@ def paper(run: Run, variant: str) -> str:
 
     Args:
         run: an evaluation on PartNet-Mobility's train_test, test or both.
-        variant: which of :data:`VARIANTS` its network is.
+        variant: which of the published networks its own is compared with: "mask" (of what moves), "no_mask" or
+            "no_mask_vpa" (viewpoint augmentation).
 
     Raises:
         UserError: the run measured neither split.
@@ -85,8 +83,7 @@ def _flow_cells(rows: Sequence[FlowRow], metric: Metric, theirs: float, mean: st
     """Ours with its interval, and theirs."""
     if not rows:
         return f"– | {theirs:.3f}"
-    found = measure(rows, metric)
-    value, interval = (found.class_, found.class_ci95) if mean == "class" else (found.instance, found.instance_ci95)
+    value, interval = _of(measure(rows, metric), mean)
     assert value is not None
     better = value > theirs if metric.key == "flow/cosine" else value < theirs
     own, other = f"{value:.3f}", f"{theirs:.3f}"
@@ -114,10 +111,15 @@ def _success(rows: Sequence[TrialRow]) -> Iterator[str]:
 
 
 def _percent(found: Means, mean: str) -> str:
-    value, interval = (found.class_, found.class_ci95) if mean == "class" else (found.instance, found.instance_ci95)
+    value, interval = _of(found, mean)
     if value is None:
         return "–"
     return f"{100 * value:.1f} %" + (f" ({SUCCESS.show_interval(interval)})" if interval else "")
+
+
+def _of(found: Means, mean: str) -> tuple[float | None, Interval | None]:
+    """The "instance" or "class" mean with its interval."""
+    return (found.class_, found.class_ci95) if mean == "class" else (found.instance, found.instance_ci95)
 
 
 def _differences(run: Run) -> Iterator[str]:

@@ -22,7 +22,7 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.files import write_bytes
 from fb3d_rl.models.delayed import DelayedPointNet2
 from fb3d_rl.models.dense import initialize
-from fb3d_rl.models.pointnet2 import PointNet2, PointwiseNet
+from fb3d_rl.models.pointnet2 import PointNet2
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])
 
@@ -31,7 +31,7 @@ POINTS = 1200
 
 FORMAT = "fb3d_rl artflownet 1"
 
-BACKBONES: dict[str, type[PointwiseNet]] = {"pointnet2": PointNet2, "delayed": DelayedPointNet2}
+BACKBONES: dict[str, type[PointNet2] | type[DelayedPointNet2]] = {"pointnet2": PointNet2, "delayed": DelayedPointNet2}
 
 PRETRAINED = Path(__file__).resolve().parents[2] / "results" / "pretrained" / "artflownet.safetensors"
 """The weights that this project publishes."""
@@ -132,8 +132,10 @@ class ArtFlowNet(nn.Module):
 
     def digest(self) -> str:
         """SHA-256 of weights and statistics."""
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        return hashlib.sha256(save(tensors)).hexdigest()
+        return hashlib.sha256(save(self._tensors())).hexdigest()
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
 
     def save_pretrained(self, path: str | Path, about: Mapping[str, str] | None = None) -> None:
         """Write weights and arguments as one safetensors file, in one step.
@@ -143,8 +145,7 @@ class ArtFlowNet(nn.Module):
             about: further facts to keep in the file: command, data, seed, revision.
         """
         metadata = {"format": FORMAT, "arguments": json.dumps(self.arguments), **(about or {})}
-        tensors = {name: value.detach().cpu().contiguous() for name, value in self.state_dict().items()}
-        write_bytes(Path(path), save(tensors, metadata))
+        write_bytes(Path(path), save(self._tensors(), metadata))
 
     @classmethod
     def from_pretrained(cls, path: str | Path = "pretrained") -> ArtFlowNet:

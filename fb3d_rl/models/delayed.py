@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from fb3d_rl.geometry import points as ops
 from fb3d_rl.models.dense import DenseLayer, DenseMLP
-from fb3d_rl.models.pointnet2 import FeaturePropagation, GlobalAbstraction, Level, PointwiseNet
+from fb3d_rl.models.pointnet2 import FeaturePropagation, GlobalAbstraction, Level, PointwiseNet, map_with_place
 
 # Said once in every process, of what the tests hold here.
 warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
@@ -57,24 +57,10 @@ class PooledAbstraction(nn.Module):
         own = first.activate(map_with_place(first, features, points))
         for layer in others:
             own = layer(own)
-        with torch.no_grad():
-            coarse = fine.coarser(self.ratio)
-            index, mask = ops.ball_query(fine.points, coarse.points, self.radius, self.neighbors, fine.valid)
-            index = coarse.flat(fine.row.gather(1, index.flatten(1)).view_as(index))
-        best = pooled_max(map_with_place(self.pooled, own, points), index, coarse.flat(mask))
+        coarse, index, mask = fine.balls(self.ratio, self.radius, self.neighbors)
+        best = pooled_max(map_with_place(self.pooled, own, points), index, mask)
         best = best - map_with_place(self.pooled, None, coarse.flat(coarse.points))
         return own, self.after(self.pooled.activate(best)), coarse
-
-
-def map_with_place(layer: DenseLayer, features: Tensor | None, points: Tensor) -> Tensor:
-    """The layer's linear map of (features [P, C], points [P, 3]) -> [P, out]; of the points alone without features.
-
-    The points' part is exact under autocast, too, which would round places to some 4 mm.
-    """
-    weight = layer.linear.weight
-    with torch.autocast(points.device.type, enabled=False):
-        rows = points @ weight[:, -3:].T
-    return rows if features is None else rows + functional.linear(features, weight[:, :-3])
 
 
 def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
@@ -91,10 +77,10 @@ def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
 
 
 class DelayedPointNet2(PointwiseNet):
-    """See the module and the base class."""
+    """See the module; arguments as of :class:`fb3d_rl.models.pointnet2.PointNet2`."""
 
     def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
-        super().__init__(inputs, outputs, neighbors)
+        super().__init__(outputs)
         self.sa1 = PooledAbstraction(inputs, (32, 64, 64), (128, 128), 0.2, 0.2, neighbors)
         self.sa2 = PooledAbstraction(128, (128, 256), (256,), 0.25, 0.4, neighbors)
         self.sa3 = GlobalAbstraction(256, (256, 512))

@@ -12,7 +12,7 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.delayed import DelayedPointNet2, PooledAbstraction
 from fb3d_rl.models.dense import DenseLayer, DenseMLP
-from fb3d_rl.models.pointnet2 import FeaturePropagation, PointNet2, SetAbstraction
+from fb3d_rl.models.pointnet2 import FeaturePropagation, SetAbstraction
 
 
 class DenseArtFlowNet(nn.Module):
@@ -29,7 +29,6 @@ class DenseArtFlowNet(nn.Module):
     def forward(self, points: Tensor, part_mask: Tensor) -> Tensor:
         """See the class."""
         network = self.net.network
-        assert isinstance(network, (PointNet2, DelayedPointNet2))
         points = points - points.mean(1, keepdim=True)
         own = part_mask[..., None].to(points.dtype) if self.net.part_mask_input else None
         if isinstance(network, DelayedPointNet2):

@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fb3d_rl.geometry import points as ops
-from fb3d_rl.models.dense import DenseMLP
+from fb3d_rl.models.dense import DenseLayer, DenseMLP
 from fb3d_rl.models.grouped import Grouping, grouped_max, make_grouping
 
 
@@ -64,6 +64,27 @@ class Level:
         keep = torch.arange(most, device=chosen.device) < count
         return Level.of(ops.gather(self.points, chosen), keep)
 
+    @torch.no_grad()
+    def balls(self, ratio: float, radius: float, neighbors: int) -> tuple[Level, Tensor, Tensor]:
+        """Coarser points, and around each [Q] at most K of these points: their rows [Q, K], real where a mask [Q, K] is
+        (first in each row; the other slots repeat the first).
+        """
+        coarse = self.coarser(ratio)
+        index, mask = ops.ball_query(self.points, coarse.points, radius, neighbors, self.valid)
+        rows = self.row.gather(1, index.flatten(1)).view_as(index)
+        return coarse, coarse.flat(rows), coarse.flat(mask)
+
+
+def map_with_place(layer: DenseLayer, features: Tensor | None, points: Tensor) -> Tensor:
+    """The layer's linear map of (features [P, C], points [P, 3]) -> [P, out]; of the points alone without features.
+
+    The points' part is exact under autocast, too, which would round places to some 4 mm.
+    """
+    weight = layer.linear.weight
+    with torch.autocast(points.device.type, enabled=False):
+        rows = points @ weight[:, -3:].T
+    return rows if features is None else rows + functional.linear(features, weight[:, :-3])
+
 
 class SetAbstraction(nn.Module):
     """Gather each centre's ball, run a three-layer MLP on (features, position relative to the centre), take
@@ -80,24 +101,20 @@ class SetAbstraction(nn.Module):
     @torch.no_grad()
     def group(self, fine: Level) -> tuple[Level, Grouping]:
         """Choose centres and their neighbours; depends on the geometry only."""
-        coarse = fine.coarser(self.ratio)
-        index, mask = ops.ball_query(fine.points, coarse.points, self.radius, self.neighbors, fine.valid)
-        rows = fine.row.gather(1, index.flatten(1)).view_as(index)
-        return coarse, make_grouping(coarse.flat(rows), coarse.flat(mask), fine.total)
+        coarse, rows, mask = fine.balls(self.ratio, self.radius, self.neighbors)
+        return coarse, make_grouping(rows, mask, fine.total)
 
     def forward(self, features: Tensor | None, fine: Level) -> tuple[Tensor, Level]:
         """Features [P, inputs] (None if inputs = 0) of the fine points -> [Q, widths[-1]] and the coarse
         points.
         """
         coarse, grouping = self.group(fine)
-        first = next(iter(self.layers)).linear.weight
-        place = first[:, self.inputs :]
-        # In float32 under autocast, too, which would round places to some 4 mm.
+        first = next(iter(self.layers))
+        # Inside the balls all is in the points' precision, under autocast, too.
         with torch.autocast(fine.points.device.type, enabled=False):
-            of_points = fine.flat(fine.points) @ place.T
-            if features is not None:
-                of_points = of_points + features.to(place.dtype) @ first[:, : self.inputs].T
-            of_centres = coarse.flat(coarse.points) @ place.T
+            own = None if features is None else features.to(fine.points.dtype)
+            of_points = map_with_place(first, own, fine.flat(fine.points))
+            of_centres = map_with_place(first, None, coarse.flat(coarse.points))
             return grouped_max(of_points, of_centres, grouping, self.layers), coarse
 
 
@@ -159,19 +176,14 @@ class FeaturePropagation(nn.Module):
 class PointwiseNet(nn.Module):
     """A network with a vector of ``outputs`` numbers for each point.
 
-    Args:
-        inputs: feature channels of each point beside its position.
-        outputs: numbers for each point.
-        neighbors: points kept in a ball.
-
     Shapes:
         points [B, N, 3] m, valid [B, N] bool, features [B, N, inputs] or None -> [B, N, outputs], 0 on
         padding.
     """
 
-    def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
+    def __init__(self, outputs: int) -> None:
         super().__init__()
-        self.inputs, self.outputs, self.neighbors = inputs, outputs, neighbors
+        self.outputs = outputs
 
     def rows(self, features: Tensor | None, cloud: Level) -> Tensor:
         """Features [P, inputs] of the valid points -> [P, outputs]; P > 0."""
@@ -191,10 +203,16 @@ class PointwiseNet(nn.Module):
 
 
 class PointNet2(PointwiseNet):
-    """PointNet++ as in the paper; see the module and the class above."""
+    """PointNet++ as in the paper; see the module.
+
+    Args:
+        inputs: feature channels of each point beside its position.
+        outputs: numbers for each point.
+        neighbors: points kept in a ball.
+    """
 
     def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
-        super().__init__(inputs, outputs, neighbors)
+        super().__init__(outputs)
         self.sa1 = SetAbstraction(inputs, (64, 64, 128), ratio=0.2, radius=0.2, neighbors=neighbors)
         self.sa2 = SetAbstraction(128, (128, 128, 256), ratio=0.25, radius=0.4, neighbors=neighbors)
         self.sa3 = GlobalAbstraction(256, (256, 512, 1024))
