@@ -110,6 +110,7 @@ class ArtFlowNetConfig(AlgoConfig):
     jitter: float
     dropout: float
     precision: str
+    compile: bool
     log_every: int
     evaluate_every: int | None
     checkpoint_every: int | None

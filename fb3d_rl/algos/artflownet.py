@@ -24,7 +24,7 @@ from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, fit
+from fb3d_rl.training.fit import FitOptions, fit, require_compiler
 from fb3d_rl.training.processes import rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
 
@@ -62,6 +62,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
     if met_by is not None:
         setup.require_simulator()
+    if options.compile:
+        require_compiler(device)
     samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)
@@ -168,6 +170,7 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
         jitter=algo.jitter,
         dropout=algo.dropout,
         precision=algo.precision,
+        compile=algo.compile,
         seed=cfg.seed,
         log_every=algo.log_every,
         evaluate_every=algo.evaluate_every,

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fb3d_rl.geometry import points as ops
-from fb3d_rl.models.dense import DenseLayer, DenseMLP
+from fb3d_rl.models.dense import DenseLayer, DenseMLP, eager
 from fb3d_rl.models.pointnet2 import FeaturePropagation, GlobalAbstraction, Level, PointwiseNet, map_with_place
 
 # Said once in every process, of what the tests hold here.
@@ -63,6 +63,7 @@ class PooledAbstraction(nn.Module):
         return own, self.after(self.pooled.activate(best)), coarse
 
 
+@eager
 def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
     """Maximum of rows [P, C] over each ball, index [Q, K] of which mask [Q, K] is real (the first of a ball always), ->
     [Q, C].

@@ -9,6 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+eager = torch.compiler.disable
+"""Keeps a function out of a compiled network: its loops are long, or the shapes of its results follow from values."""
+
 
 class DenseLayer(nn.Module):
     """Linear, batch norm, ReLU on rows [P, in] -> [P, out]. Batch norm's shift makes a bias redundant."""

@@ -24,7 +24,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from fb3d_rl.models.dense import DenseMLP
+from fb3d_rl.models.dense import DenseMLP, eager
 
 _BLOCK_ROWS = 4096  # x 64 to 256 channels x 4 bytes: a few blocks fit in two cores' caches
 
@@ -296,6 +296,7 @@ def _mask_by_relu(gradient: Tensor, activation: Tensor) -> None:
     torch.ops.aten.threshold_backward.grad_input(gradient, activation, 0, grad_input=gradient)
 
 
+@eager
 def grouped_max(u: Tensor, v: Tensor, group: Grouping, layers: DenseMLP) -> Tensor:
     """Maximum over each ball of the layers' output.
 

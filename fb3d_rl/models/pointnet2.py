@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fb3d_rl.geometry import points as ops
-from fb3d_rl.models.dense import DenseLayer, DenseMLP
+from fb3d_rl.models.dense import DenseLayer, DenseMLP, eager
 from fb3d_rl.models.grouped import Grouping, grouped_max, make_grouping
 
 
@@ -47,14 +47,25 @@ class Level:
     total: int
 
     @classmethod
+    @eager
     def of(cls, points: Tensor, valid: Tensor) -> Level:
         """Number the valid points."""
         row = valid.flatten().cumsum(0).view_as(valid)
         return cls(points, valid, (row - 1).clamp_(min=0), int(row[-1, -1]))
 
+    @eager
     def flat(self, values: Tensor) -> Tensor:
         """Values [B, N, ...] -> [P, ...]."""
         return values.flatten(0, 1) if self.total == self.valid.numel() else values[self.valid]
+
+    @eager
+    def padded(self, rows: Tensor) -> Tensor:
+        """Rows [P, C] -> [B, N, C], 0 on padding."""
+        if self.total == self.valid.numel():
+            return rows.view(*self.valid.shape, -1)
+        output = rows.new_zeros(*self.valid.shape, rows.shape[1])
+        output[self.valid] = rows
+        return output
 
     def coarser(self, ratio: float) -> Level:
         """Farthest points, ceil(ratio * number of valid points) of each cloud."""
@@ -64,6 +75,7 @@ class Level:
         keep = torch.arange(most, device=chosen.device) < count
         return Level.of(ops.gather(self.points, chosen), keep)
 
+    @eager
     @torch.no_grad()
     def balls(self, ratio: float, radius: float, neighbors: int) -> tuple[Level, Tensor, Tensor]:
         """Coarser points, and around each [Q] at most K of these points: their rows [Q, K], real where a mask [Q, K] is
@@ -73,6 +85,14 @@ class Level:
         index, mask = ops.ball_query(self.points, coarse.points, radius, neighbors, self.valid)
         rows = self.row.gather(1, index.flatten(1)).view_as(index)
         return coarse, coarse.flat(rows), coarse.flat(mask)
+
+    @eager
+    @torch.no_grad()
+    def nearest(self, fine: Level) -> tuple[Tensor, Tensor]:
+        """Rows of the three points that are the nearest to each of the finer points [P', 3], and their weights."""
+        index, share = ops.three_nn(self.points, fine.points, self.valid)
+        index = self.row.gather(1, index.flatten(1)).view_as(index)
+        return fine.flat(index), fine.flat(share)
 
 
 def map_with_place(layer: DenseLayer, features: Tensor | None, points: Tensor) -> Tensor:
@@ -98,6 +118,7 @@ class SetAbstraction(nn.Module):
         self.layers = DenseMLP(inputs + 3, *widths)
         self.inputs, self.ratio, self.radius, self.neighbors = inputs, ratio, radius, neighbors
 
+    @eager
     @torch.no_grad()
     def group(self, fine: Level) -> tuple[Level, Grouping]:
         """Choose centres and their neighbours; depends on the geometry only."""
@@ -160,11 +181,8 @@ class FeaturePropagation(nn.Module):
             clouds = torch.arange(len(rows), device=rows.device)[:, None].expand_as(fine.valid)
             rows = ops.take_rows(rows, fine.flat(clouds))
         else:
-            with torch.no_grad():
-                index, share = ops.three_nn(coarse.points, fine.points, coarse.valid)
-                index = coarse.row.gather(1, index.flatten(1)).view_as(index)
-            share = fine.flat(share).to(rows.dtype)
-            rows = functional.embedding_bag(fine.flat(index), rows, per_sample_weights=share, mode="sum")
+            index, share = coarse.nearest(fine)
+            rows = functional.embedding_bag(index, rows, per_sample_weights=share.to(rows.dtype), mode="sum")
         if skip is not None:
             rows = rows + skip @ weight[:, self.inputs :].T
         rows = first.activate(rows)
@@ -194,12 +212,7 @@ class PointwiseNet(nn.Module):
         cloud = Level.of(points, valid)
         if cloud.total == 0:
             return points.new_zeros(*valid.shape, self.outputs)
-        rows = self.rows(None if features is None else cloud.flat(features), cloud)
-        if cloud.total == valid.numel():
-            return rows.view(*valid.shape, -1)
-        output = rows.new_zeros(*valid.shape, self.outputs)
-        output[valid] = rows
-        return output
+        return cloud.padded(self.rows(None if features is None else cloud.flat(features), cloud))
 
 
 class PointNet2(PointwiseNet):

@@ -67,6 +67,8 @@ class FitOptions:
         dropout: take up to this share of its points, drawn for every cloud, out of it.
         precision: "fp32", or "bf16": a flow network's products in bfloat16 (autocast), its weights, places and the rest
             in float32.
+        compile: run a flow network's layers through torch.compile, which takes a while before the first step and pays
+            on GPUs at most: what costs time on a CPU, the balls, stays as it is.
         seed: of the rows drawn and of the rotations.
         log_every: steps from one log row to the next.
         evaluate_every: steps from one evaluation to the next; None only at the end.
@@ -86,6 +88,7 @@ class FitOptions:
     jitter: float = 0.0
     dropout: float = 0.0
     precision: str = "fp32"
+    compile: bool = False
     seed: int = 0
     log_every: int = 10
     evaluate_every: int | None = None
@@ -160,15 +163,31 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
 
     ``share`` is the part of the whole batch that the objective is given.
     """
+    network = torch.compile(model, dynamic=True) if options.compile else model
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
         batch = augment(batch, options, step, share)
         points, valid = batch["observation", "points"], batch["observation", "valid"]
         with torch.autocast(points.device.type, torch.bfloat16, enabled=options.precision == "bf16"):
-            predicted = model(points, valid, batch["observation", "part_mask"])
+            predicted = network(points, valid, batch["observation", "part_mask"])
         return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
 
     return objective
+
+
+def require_compiler(device: torch.device) -> None:
+    """Check that torch.compile can work.
+
+    Raises:
+        UserError: it cannot, for want of a compiler.
+    """
+    try:
+        torch.compile(torch.neg)(torch.ones(2, device=device))
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(
+            f"torch.compile does not work here ({reason}): install a C++ compiler (on a GPU: Triton), or leave it off"
+        ) from error
 
 
 def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice = slice(None)) -> TensorDictBase:
@@ -380,7 +399,7 @@ def fit(
                 numbers = evaluate(measured)
                 measured.train()
                 if log is not None:
-                    log({"step": step, **numbers})
+                    log({"step": step, **numbers, "time/seconds": time.perf_counter() - started})
             # Processes stop together, or the others would wait for this one for ever.
             overdue = options.max_minutes is not None and seconds > 60 * options.max_minutes
             late, stopped = (count > 0 for count in summed(overdue, interrupt.is_set()))
@@ -402,7 +421,7 @@ def fit(
 def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:
     """Refuse to continue a run under options that would have led elsewhere."""
     decisive = ["batch_size", "lr", "schedule", "clip_norm", "ema", "rotate", "mirror", "scale", "jitter", "dropout"]
-    decisive += ["precision", "seed"]
+    decisive += ["precision", "compile", "seed"]
     if options.schedule != "constant":
         decisive.append("steps")
     for name in decisive:

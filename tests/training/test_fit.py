@@ -18,7 +18,16 @@ from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.models.artflownet import ArtFlowNet
-from fb3d_rl.training.fit import FitOptions, augment, batch_rows, fit, flow_loss, learning_rate, rotate_about_z
+from fb3d_rl.training.fit import (
+    FitOptions,
+    augment,
+    batch_rows,
+    fit,
+    flow_loss,
+    learning_rate,
+    require_compiler,
+    rotate_about_z,
+)
 
 
 def make_rows(rows: int = 6, points: int = 64) -> TensorDict:
@@ -242,3 +251,30 @@ def test_jitter_moves_points_alone_and_dropout_takes_them_out() -> None:
     assert not (left & ~valid).any() and (share >= 0.45).all() and share.min() < 0.8 and share.std() > 0.05
     assert torch.equal(thin["observation", "part_mask"], left)
     assert torch.equal(thin["privileged", "flow"][..., 0] != 0, left)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("backbone", ["pointnet2", "delayed"])
+def test_a_compiled_network_learns_what_the_other_learns(backbone: str) -> None:
+    """Adam's first steps amplify what rounding changes, so that losses agree to a percent only."""
+    losses, compiled = {}, []
+    for compile_ in (False, True):
+        net = ArtFlowNet(neighbors=16, backbone=backbone, generator=torch.Generator().manual_seed(0))
+        log: list[dict[str, Any]] = []
+        options = FitOptions(steps=4, batch_size=4, log_every=1, compile=compile_)
+        torch._dynamo.reset()
+        torch._dynamo.utils.counters.clear()
+        fit(net, make_rows(), options, log=log.append, progress=False)
+        losses[compile_] = [row["train/loss"] for row in log]
+        compiled.append(torch._dynamo.utils.counters["stats"]["unique_graphs"])
+    assert losses[True] == pytest.approx(losses[False], rel=0.02)
+    assert compiled[0] == 0 and compiled[1] > 2
+
+
+def test_compiling_without_a_compiler_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(function: Any) -> Any:
+        raise RuntimeError("InvalidCxxCompiler: no working C++ compiler\n\nlong explanation")
+
+    monkeypatch.setattr(torch, "compile", broken)
+    with pytest.raises(UserError, match=r"no working C\+\+ compiler\): install a C\+\+ compiler"):
+        require_compiler(torch.device("cpu"))
