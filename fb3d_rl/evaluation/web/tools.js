@@ -1,42 +1,41 @@
-{
-// ---------------------------------------------------------------------------- tables sort by the head that is clicked
-// What a cell shows, without its small print.
+// What a cell shows, without its small print, and its value: "+5", "−12", "5,030", "58 %", "7–9" count as numbers.
 const shown = cell =>
   [...cell.childNodes].filter(node => node.nodeName !== 'SMALL').map(node => node.textContent).join(' ').trim();
-const value = text => parseFloat(text.replace('\u2212', '-').replace(/,(?=\d{3})/g, ''));
+const number = text => parseFloat(text.replace('\u2212', '-').replace(/,(?=\d{3})/g, ''));
 const missing = text => text === '' || text === '\u2013';
 
 function sorted(rows, column, direction) {
   if (direction === 'none') return rows;
   const keyed = rows.map(row => [shown(row.cells[column]), row]);
   const known = keyed.filter(([text]) => !missing(text));
-  const numbers = known.every(([text]) => !isNaN(value(text)));
+  const numbers = known.every(([text]) => !isNaN(number(text)));
   const sign = direction === 'ascending' ? 1 : -1;
-  known.sort(([a], [b]) => sign * (numbers ? value(a) - value(b) : a.localeCompare(b, 'en', {numeric: true})));
+  known.sort(([a], [b]) => sign * (numbers ? number(a) - number(b) : a.localeCompare(b, 'en', {numeric: true})));
   return [...known, ...keyed.filter(([text]) => missing(text))].map(([, row]) => row);
 }
 
-const following = {none: 'ascending', ascending: 'descending', descending: 'none'};
-for (const table of document.querySelectorAll('table.sortable')) {
+// The first body sorts by the column whose head is clicked: up, down, as it was. Bodies below it stay.
+function sortable(table) {
   const body = table.tBodies[0], rows = [...body.rows];
-  if (rows.length < 2) continue;
   const heads = [...table.tHead.querySelectorAll('th:not([colspan])')];
+  const following = {none: 'ascending', ascending: 'descending', descending: 'none'};
   heads.forEach((head, column) => {
-    if (!head.textContent) return;
+    if (rows.length < 2 || !head.textContent) return;
     const button = document.createElement('button');
     button.append(...head.childNodes);
     head.append(button);
     head.setAttribute('aria-sort', 'none');
     button.addEventListener('click', () => {
       const next = following[head.getAttribute('aria-sort')];
-      for (const other of heads) other.setAttribute('aria-sort', other === head ? next : 'none');
+      for (const other of table.tHead.querySelectorAll('th[aria-sort]')) other.setAttribute('aria-sort', 'none');
+      head.setAttribute('aria-sort', next);
       body.append(...sorted(rows, column, next));
     });
   });
 }
 
-// --------------------------------------------------------------------------------------------- filters and choices
-for (const block of document.querySelectorAll('.filters')) {
+// An item is shown if it has what every list names: the value "policy:bc" asks for data-policy="bc".
+function filtered(block) {
   const lists = [...block.querySelectorAll('.bar select')], output = block.querySelector('output');
   const items = [...block.querySelectorAll('[data-item]')];
   const count = new Set(items.map(item => item.dataset.item)).size;
@@ -57,19 +56,18 @@ for (const block of document.querySelectorAll('.filters')) {
   apply();
 }
 
-for (const block of document.querySelectorAll('.choice')) {
+function choosing(block) {
   const list = block.querySelector('select'), parts = [...block.querySelectorAll('.chosen')];
   const apply = () => {
     parts.forEach((part, i) => { part.hidden = i !== list.selectedIndex; });
-    // Figures that were hidden have no size yet.
+    // Figures that were hidden take their size now.
     dispatchEvent(new Event('resize'));
   };
   list.addEventListener('change', apply);
-  if (list.selectedIndex) apply();
+  apply();
 }
 
-// ---------------------------------------------------------------------------------------------------------- copying
-for (const button of document.querySelectorAll('button.copy')) {
+function copying(button) {
   button.addEventListener('click', async () => {
     const code = button.previousElementSibling;
     getSelection().selectAllChildren(code);
@@ -82,4 +80,8 @@ for (const button of document.querySelectorAll('button.copy')) {
     setTimeout(() => { button.textContent = 'copy'; }, 2000);
   });
 }
-}
+
+document.querySelectorAll('table.sortable').forEach(sortable);
+document.querySelectorAll('.filters').forEach(filtered);
+document.querySelectorAll('.choice').forEach(choosing);
+document.querySelectorAll('button.copy').forEach(copying);
