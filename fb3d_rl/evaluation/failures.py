@@ -92,7 +92,7 @@ def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> str:
     if len(charts) > 2:
         # The expert's chart tells the least.
         chosen = sorted(charts, key=lambda chart: all(row.policy == "expert" for row in groups[chart[0]]))
-        return bars("ends", groups) + page.choice("the way of the trials of", chosen)
+        return bars("ends", groups) + page.choice("stages of the trials of", chosen)
     titled = (f"<div><h3>{text(name)}</h3>{chart}</div>" for name, chart in charts)
     return (page.grid(titled) if charts else "") + (bars("ends", groups) if len(groups) > 1 else "")
 
@@ -116,6 +116,7 @@ def flow_chart(id_: str, rows: Sequence[TrialRow]) -> str:
             node={
                 "label": [f"{text(_SHORT.get(name, name))} {count}" for name, count in counts.items()],
                 "color": [_STAGE if name in through else ENDS.get(name, _OTHER) for name in names],
+                "align": "left",
                 "x": x,
                 "y": y,
                 "pad": _GAP,
