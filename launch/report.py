@@ -14,6 +14,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+VARIANTS = ("mask", "no_mask", "no_mask_vpa")
+"""The published networks, named here because reading them takes a second; a test holds them to published.json."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (2: an error that the user can mend)."""
@@ -30,14 +33,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--paper", action="store_true", help="set one run beside what is published, as Markdown")
     parser.add_argument(
         "--variant",
-        default="mask",
-        choices=("mask", "no_mask", "no_mask_vpa"),
-        help="with --paper: the published network to compare with (default: mask)",
+        default=VARIANTS[0],
+        choices=VARIANTS,
+        help=f"with --paper: the published network to compare with (default: {VARIANTS[0]})",
     )
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
     from fb3d_rl.contract import UserError
-    from fb3d_rl.evaluation import comparison, published, report, runs, tables
+    from fb3d_rl.evaluation import comparison, comparison_page, published, report, runs, tables
     from fb3d_rl.files import write_text
 
     folders: list[Path] = options.runs
@@ -56,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             found = comparison.compare([runs.read_run(run) for run in finished])
             resolved = [folder.resolve() for folder in folders]
             beside = resolved[0] if len(folders) == 1 else Path(os.path.commonpath([run.parent for run in resolved]))
-            path = report.write_comparison(found, options.out or beside / "comparison.html", unfinished)
+            path = comparison_page.write_comparison(found, options.out or beside / "comparison.html", unfinished)
             comparison.show(found)
             if unfinished:
                 print(f"left out, not finished (no summary.json): {', '.join(map(str, unfinished))}")

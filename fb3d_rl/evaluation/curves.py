@@ -77,6 +77,9 @@ def panel(id_: str, title: str, x_title: str, lines: Sequence[Line], *, legend: 
     )
     if "loss" in title and all(value > 0 for line in lines for value in line.y):
         plot.update_yaxes(type="log", dtick="D2", tickformat="~g")
+    elif not percent and all(value == 0 for line in lines for value in line.y):
+        # By itself the axis would go below 0, where a count cannot be.
+        plot.update_yaxes(range=[-0.02, 1.02])
     return page.figure(id_, plot)
 
 

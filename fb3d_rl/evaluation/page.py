@@ -1,7 +1,8 @@
 """The look of the reports: one self-contained HTML page with figures that follow the light or dark scheme.
 
-The page loads nothing: plotly.js stands inside, and a content security policy forbids every request. Whatever
-is called body or block is HTML already; :func:`text` makes strings from outside harmless.
+The page loads nothing: style, scripts (the folder web/) and plotly.js stand inside, and a content security policy
+forbids every request. Whatever is called body, block or cell is HTML already; :func:`text` makes strings from outside
+harmless.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import base64
 import html
 import json
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
+from importlib import resources
 from typing import Any
 
 import plotly.graph_objects as go
@@ -29,169 +32,6 @@ TRUE, PREDICTED, PART, STATIC = "#2f9e77", "#e0782f", "#3b7dd8", "#98a2b3"
 
 _CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:"
 
-_CSS = """
-:root { color-scheme: light dark; --ground: #f6f7f9; --panel: #fff; --ink: #1a1f2b; --soft: #5c6575;
-  --line: #e1e4ea; --bad: #b3261e; }
-@media (prefers-color-scheme: dark) { :root { --ground: #12151b; --panel: #1a1f28; --ink: #e7eaf0;
-  --soft: #9aa4b5; --line: #2c333f; --bad: #ff8a80; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--ground); color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
-main { max-width: 1160px; margin: 0 auto; padding: 32px 24px 64px; }
-h1 { font-size: 26px; margin: 0 0 4px; letter-spacing: -.01em; overflow-wrap: anywhere; }
-h2 { font-size: 18px; margin: 40px 0 12px; }
-h3 { font-size: 14px; margin: 20px 0 8px; color: var(--soft); font-weight: 600; }
-p { margin: 0 0 12px; max-width: 80ch; }
-.soft { color: var(--soft); }
-code, pre { font: 13px/1.5 ui-monospace, "SF Mono", Menlo, Consolas, monospace; overflow-wrap: anywhere; }
-pre { overflow: auto; max-height: 420px; }
-dl { display: grid; grid-template-columns: max-content minmax(0, 100ch); gap: 2px 16px; margin: 16px 0 0;
-  font-size: 14px; }
-dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
-.cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(210px, 1fr)); gap: 12px; }
-.card { background: var(--panel); border: 1px solid var(--line); border-radius: 10px; padding: 12px 14px; }
-.card .name { color: var(--soft); font-size: 13px; }
-.card .value { font-size: 25px; font-weight: 600; line-height: 1.3; font-variant-numeric: tabular-nums; }
-.card .more { color: var(--soft); font-size: 12.5px; font-variant-numeric: tabular-nums; }
-.panel { background: var(--panel); border: 1px solid var(--line); border-radius: 10px; padding: 14px; }
-.scroll { overflow: auto; max-height: 520px; padding: 0; }
-.wide { overflow-x: auto; padding: 0; }
-table { border-collapse: collapse; width: 100%; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: 5px 9px; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { color: var(--soft); font-weight: 600; white-space: normal; vertical-align: bottom; }
-th.text, td.text { text-align: left; }
-td.wrap { white-space: normal; overflow-wrap: anywhere; min-width: 180px; }
-th.group { text-align: center; color: var(--ink); border-bottom: 2px solid var(--swatch, var(--line)); }
-td.first, th.first { border-left: 1px solid var(--line); }
-tbody tr:last-child td { border-bottom: 0; }
-tr.mean td { font-weight: 600; } tr.mean small { font-weight: 400; color: var(--soft); display: block; }
-tbody + tbody { border-top: 2px solid var(--line); }
-.wide .text:first-child { position: sticky; left: 0; background: var(--panel); }
-.scroll thead th { position: sticky; top: 0; background: var(--panel); }
-.error { color: var(--bad); }
-details { margin-top: 12px; } summary { cursor: pointer; font-weight: 600; margin-bottom: 8px; }
-select, button { font: inherit; color: inherit; background: var(--ground); border: 1px solid var(--line);
-  border-radius: 7px; padding: 5px 10px; max-width: 100%; }
-.bar { display: flex; flex-wrap: wrap; gap: 8px 12px; align-items: center; margin-bottom: 8px; }
-.pair { display: grid; grid-template-columns: 1fr 1fr; text-align: center; font-weight: 600;
-  margin-top: 12px; }
-.dot { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin-right: 5px; }
-.legend { color: var(--soft); font-size: 13px; display: flex; flex-wrap: wrap; gap: 4px 14px; }
-.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(100%, 430px), 1fr)); gap: 12px;
-  margin-top: 10px; }
-.grid.small { grid-template-columns: repeat(auto-fill, minmax(min(100%, 260px), 1fr)); }
-.grid > * { min-width: 0; }
-figure { margin: 0; } figcaption { color: var(--soft); font-size: 13px; margin-top: 6px; overflow-wrap: anywhere; }
-td.named { padding-left: 26px; white-space: normal; max-width: 300px; overflow-wrap: break-word; }
-td.named .dot { float: left; margin: 5px 0 0 -17px; }
-video, figure img { width: 100%; border-radius: 6px; display: block; background: #fff; }
-@media (max-width: 600px) {
-  main { padding: 20px 12px 48px; } .panel { padding: 8px; } .wide, .scroll { padding: 0; }
-  dl { grid-template-columns: minmax(0, 1fr); } dd { margin-bottom: 6px; }
-  .cards { grid-template-columns: repeat(2, minmax(0, 1fr)); gap: 8px; } .card .value { font-size: 21px; }
-  th, td { padding: 5px 7px; }
-  .wide .text:first-child { white-space: normal; overflow-wrap: break-word; max-width: 150px; }
-}
-"""
-
-# Figures are drawn transparent; their ink comes from the page's CSS variables, again when the scheme changes.
-_THEME_JS = """
-const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-function themed(layout) {
-  const axis = {gridcolor: css('--line'), zerolinecolor: css('--line'), linecolor: css('--line')};
-  const out = {...layout, paper_bgcolor: 'rgba(0,0,0,0)', plot_bgcolor: 'rgba(0,0,0,0)',
-    font: {family: 'system-ui, sans-serif', size: 12, color: css('--ink')}};
-  for (const key of Object.keys(layout)) if (/^[xy]axis/.test(key)) out[key] = {...layout[key], ...axis};
-  return out;
-}
-const config = {displayModeBar: false, responsive: true};
-const figures = [];
-function draw(id, figure) {
-  figures.push([id, figure]);
-  return Plotly.newPlot(id, figure.data, themed(figure.layout), config);
-}
-matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => {
-  for (const [id, figure] of figures) Plotly.react(id, figure.data, themed(figure.layout), config);
-});
-for (const node of document.querySelectorAll('script[data-figure]'))
-  draw(node.dataset.figure, JSON.parse(node.textContent));
-"""
-
-_VIEWER_JS = """
-const view = JSON.parse(document.getElementById('clouds').textContent);
-const choice = document.getElementById('cloud-choice');
-const frame = {showticklabels: false, title: {text: ''}, showspikes: false, zeroline: false, showgrid: false,
-  showbackground: false};
-// PartNet-Mobility's objects face -x. Narrow scenes are seen from further away, so that nothing is cut off.
-const startCamera = () => {
-  const far = Math.max(1.08, 1080 / document.getElementById('viewer').clientWidth);
-  return {eye: {x: -1.1 * far, y: 0.6 * far, z: 0.55 * far}};
-};
-function dots(points, color, scene, name) {
-  return {type: 'scatter3d', mode: 'markers', scene, name, hoverinfo: 'skip', showlegend: false,
-    x: points[0], y: points[1], z: points[2], marker: {size: 2, color}};
-}
-function arrows(flow, color, scene, size) {
-  // Shafts as one broken line, heads as cones of one length.
-  const shaft = [[], [], []], tip = [[], [], []], along = [[], [], []];
-  flow.start.forEach((start, i) => {
-    const norm = Math.hypot(...flow.vector[i]);
-    for (let k = 0; k < 3; k++) {
-      const end = start[k] + size * flow.vector[i][k];
-      shaft[k].push(start[k], end, null);
-      tip[k].push(end);
-      along[k].push(flow.vector[i][k] / norm * size * 0.14);
-    }
-  });
-  return [
-    {type: 'scatter3d', mode: 'lines', scene, hoverinfo: 'skip', showlegend: false, x: shaft[0], y: shaft[1],
-      z: shaft[2], line: {color, width: 3}},
-    {type: 'cone', scene, hoverinfo: 'skip', showscale: false, x: tip[0], y: tip[1], z: tip[2], u: along[0],
-      v: along[1], w: along[2], anchor: 'center', sizemode: 'raw', sizeref: 1,
-      colorscale: [[0, color], [1, color]], lighting: {ambient: 0.9, diffuse: 0.2, specular: 0}},
-  ];
-}
-const viewer = {data: [], layout: {}};
-function show(index, camera) {
-  const cloud = view.clouds[index];
-  // The ratio comes from the box: by itself each scene would fit its own arrows.
-  const extent = cloud.box.map(([low, high]) => high - low), scale = 1.15 / Math.max(...extent);
-  const aspectratio = {x: extent[0] * scale, y: extent[1] * scale, z: extent[2] * scale};
-  const scene = (left, right) => ({domain: {x: [left, right]}, aspectmode: 'manual', aspectratio, camera,
-    dragmode: 'orbit',
-    xaxis: {...frame, range: cloud.box[0]}, yaxis: {...frame, range: cloud.box[1]},
-    zaxis: {...frame, range: cloud.box[2]}});
-  viewer.data = ['scene', 'scene2'].flatMap((s, k) => [
-    dots(cloud.rest, view.colors.rest, s), dots(cloud.part, view.colors.part, s),
-    ...(k ? arrows(cloud.predicted, view.colors.predicted, s, cloud.size)
-          : arrows(cloud.true, view.colors.true, s, cloud.size))]);
-  viewer.layout = {height: 520, margin: {l: 0, r: 0, t: 0, b: 0}, scene: scene(0, 0.495),
-    scene2: scene(0.505, 1)};
-  return Plotly.react('viewer', viewer.data, themed(viewer.layout), config);
-}
-const camera = () => document.getElementById('viewer').layout.scene.camera;
-view.clouds.forEach((cloud, i) => choice.add(new Option(cloud.title, i)));
-figures.push(['viewer', viewer]);
-show(0, startCamera()).then(node => {
-  let busy = false;
-  // Both scenes turn together.
-  node.on('plotly_relayout', change => {
-    const moved = change['scene.camera'] || change['scene2.camera'];
-    if (!moved || busy) return;
-    busy = true;
-    Plotly.relayout(node, {'scene.camera': moved, 'scene2.camera': moved}).then(() => { busy = false; });
-  });
-});
-choice.addEventListener('change', () => show(+choice.value, camera()));
-const step = by => () => {
-  choice.value = (+choice.value + by + view.clouds.length) % view.clouds.length;
-  show(+choice.value, camera());
-};
-document.getElementById('cloud-back').addEventListener('click', step(-1));
-document.getElementById('cloud-next').addEventListener('click', step(1));
-document.getElementById('cloud-reset').addEventListener('click', () => show(+choice.value, startCamera()));
-"""
-
 
 def text(value: object) -> str:
     """A string from outside as HTML that shows it literally."""
@@ -201,6 +41,9 @@ def text(value: object) -> str:
 def _json(value: object) -> str:
     # "<" would let a string close the script element.
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+
+
+# --------------------------------------------------------------------------------------------------------- figures
 
 
 def figure(id_: str, plot: go.Figure) -> str:
@@ -217,7 +60,7 @@ def _safe_figure(plot: go.Figure) -> str:
 
 
 def viewer(clouds: Sequence[dict[str, Any]]) -> str:
-    """Two linked 3D scenes, true next to predicted flow.
+    """Two linked 3D scenes, true next to predicted flow, on a narrow page one above the other.
 
     Args:
         clouds: per cloud "title"; "rest" and "part": coordinates of the points as [3][n] lists; "true" and
@@ -231,10 +74,85 @@ def viewer(clouds: Sequence[dict[str, Any]]) -> str:
         '<div class="panel"><div class="bar"><button id="cloud-back" aria-label="previous cloud">‹</button>'
         '<select id="cloud-choice" aria-label="cloud"></select>'
         '<button id="cloud-next" aria-label="next cloud">›</button>'
-        f'<button id="cloud-reset">reset view</button></div>{legend(names)}'
-        '<div class="pair"><div>true flow</div><div>predicted flow</div></div><div id="viewer"></div></div>'
+        f'<button id="cloud-reset">reset view</button></div>{legend(names)}<div id="viewer"></div></div>'
         f'<script type="application/json" id="clouds">{content}</script>'
     )
+
+
+# ---------------------------------------------------------------------------------------------------------- tables
+
+
+def cell(value: str, small: str = "") -> str:
+    """A cell with small print below."""
+    return f"<td>{value}<small>{small}</small></td>"
+
+
+def table(head: str, *bodies: str, scroll: bool = False) -> str:
+    """A table that sorts by the column whose head is clicked.
+
+    Args:
+        head: its rows of heads, of which those with a ``colspan`` stand above the columns' own.
+        bodies: rows; the first body is what sorts, those below it (means) stay where they are.
+        scroll: as high as a screen at most.
+    """
+    content = "".join(f"<tbody>{body}</tbody>" for body in bodies)
+    return (
+        f'<div class="panel {"scroll" if scroll else "wide"}"><table class="sortable"><thead>{head}</thead>'
+        f"{content}</table></div>"
+    )
+
+
+def plain_table(head: Sequence[str], body: str) -> str:
+    """A table with these heads, plain text, of which the first column is text."""
+    first, *others = head
+    cells = f'<th class="text">{text(first)}</th>' + "".join(f"<th>{text(name)}</th>" for name in others)
+    return table(f"<tr>{cells}</tr>", body)
+
+
+# ----------------------------------------------------------------------------------------------- choices and filters
+
+
+def choice(label: str, blocks: Sequence[tuple[str, str]]) -> str:
+    """One of several titled blocks, whichever a list of their titles (plain text) names; the first to begin with."""
+    if len(blocks) == 1:
+        return blocks[0][1]
+    options = "".join(f"<option>{text(title)}</option>" for title, _ in blocks)
+    content = "".join(
+        f'<div class="chosen"{" hidden" if i else ""}>{block}</div>' for i, (_, block) in enumerate(blocks)
+    )
+    return (
+        f'<div class="choice"><div class="bar"><label>{text(label)} <select>{options}</select></label></div>'
+        f"{content}</div>"
+    )
+
+
+def filters(fields: Iterable[tuple[str, str, Sequence[tuple[str, Mapping[str, int]]]]], noun: str, body: str) -> str:
+    """Lists that choose which of a body's elements are shown, and the count of these.
+
+    Args:
+        fields: (what the list chooses, title of "all", groups of choices) of each list. A group is (field, choices
+            with how many there are of each), plain text; it chooses elements with that ``data-<field>``.
+        noun: what is counted, such as "trials".
+        body: has the elements, those with a ``data-item``; the elements of one item share its value.
+    """
+    lists = ""
+    for label, everything, groups in fields:
+        options = f'<option value="">{text(everything)}</option>'
+        for field, choices in groups:
+            options += "".join(
+                f'<option value="{text(f"{field}:{value}")}">{text(value)} ({count})</option>'
+                for value, count in choices.items()
+            )
+        lists += f'<select aria-label="{text(label)}">{options}</select>'
+    return f'<div class="filters"><div class="bar">{lists}<output data-noun="{text(noun)}"></output></div>{body}</div>'
+
+
+def item(number: int, fields: Mapping[str, str]) -> str:
+    """The attributes that make an element one of those that :func:`filters` shows or hides."""
+    return f'data-item="{number}" ' + " ".join(f'data-{name}="{text(value)}"' for name, value in fields.items())
+
+
+# ----------------------------------------------------------------------------------------------------------- others
 
 
 def grid(blocks: Iterable[str], size: str = "") -> str:
@@ -242,13 +160,19 @@ def grid(blocks: Iterable[str], size: str = "") -> str:
     return f'<div class="grid {size}">{"".join(blocks)}</div>'
 
 
-def video(title: str, content: bytes) -> str:
+def _data(kind: str, content: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def video(content: bytes) -> str:
     """An MP4 file inside the page."""
-    data = base64.b64encode(content).decode("ascii")
-    return (
-        f'<figure class="panel"><video controls muted loop playsinline preload="metadata" '
-        f'src="data:video/mp4;base64,{data}"></video><figcaption>{text(title)}</figcaption></figure>'
-    )
+    source = _data("video/mp4", content)
+    return f'<video controls muted loop playsinline preload="metadata" src="{source}"></video>'
+
+
+def strip(title: str, content: bytes) -> str:
+    """A wide WebP picture inside the page, which scrolls where the page is narrow; ``title`` is plain text."""
+    return f'<div class="strip"><img alt="{text(title)}" src="{_data("image/webp", content)}"></div>'
 
 
 def swatch(shade: str) -> str:
@@ -276,27 +200,52 @@ def cards(entries: Iterable[tuple[str, str, Sequence[str]]]) -> str:
     )
 
 
-def facts(entries: Iterable[tuple[str, object]]) -> str:
-    """A list of names and values, plain text."""
-    return "<dl>" + "".join(f"<dt>{text(k)}</dt><dd>{text(v)}</dd>" for k, v in entries) + "</dl>"
+def facts(entries: Iterable[tuple[str, object]], copied: Container[str] = ()) -> str:
+    """A list of names and values, plain text; values of the names in ``copied`` have a button that copies them."""
+    shown = ""
+    for name, value in entries:
+        content = text(value)
+        if name in copied:
+            content = f'<code>{content}</code> <button class="copy" aria-label="copy {text(name)}">copy</button>'
+        shown += f"<dt>{text(name)}</dt><dd>{content}</dd>"
+    return f"<dl>{shown}</dl>"
+
+
+# ------------------------------------------------------------------------------------------------------------ pages
 
 
 def section(title: str, *blocks: str) -> str:
     """A titled section; nothing at all if every block is empty."""
     content = "".join(blocks)
-    return f"<section><h2>{text(title)}</h2>{content}</section>" if content else ""
+    name = re.sub(r"\W+", "-", title.lower())
+    return f'<section id="{name}"><h2>{text(title)}</h2>{content}</section>' if content else ""
 
 
 def page(title: str, body: str) -> str:
     """The whole page. ``title`` is plain text, ``body`` HTML made by this module."""
     figures = "data-figure=" in body
     clouds = 'id="viewer"' in body
-    scripts = f"<script>{get_plotlyjs()}</script>" if figures or clouds else ""
-    scripts += f"<script>{_THEME_JS}{_VIEWER_JS if clouds else ''}</script>" if scripts else ""
+    scripts = [_web("tools.js")]
+    if figures or clouds:
+        scripts = [get_plotlyjs(), *scripts, _web("figures.js")]
+    if clouds:
+        scripts.append(_web("viewer.js"))
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_CSP}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(title)}</title><style>{_CSS}</style></head>"
-        f"<body><main>{body}</main>{scripts}</body></html>\n"
+        f"<title>{text(title)}</title><style>{_web('page.css')}</style></head>"
+        f"<body>{_contents(body)}<main>{body}</main>"
+        f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>\n"
     )
+
+
+def _contents(body: str) -> str:
+    """A line of links to the sections of ``body``."""
+    found = re.findall(r'<section id="([^"]+)"><h2>(.*?)</h2>', body)
+    links = "".join(f'<a href="#{name}">{title}</a>' for name, title in found)
+    return f'<nav aria-label="sections"><div>{links}</div></nav>' if links else ""
+
+
+def _web(name: str) -> str:
+    return resources.files(__package__).joinpath("web", name).read_text("utf-8")

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -166,6 +167,12 @@ def read_flow(path: Path) -> list[FlowRow]:
         UserError: the file is missing, has other columns or a value of the wrong type.
     """
     return _read(path, FlowRow)
+
+
+def film_name(row: TrialRow) -> str:
+    """Name of the files that hold the film of a trial, without their suffixes."""
+    # Names in strangers' files may hold any character.
+    return re.sub(r"[^\w.-]", "_", f"{row.trial:03d}_{row.object}_{row.link}_{row.policy}", flags=re.ASCII)
 
 
 def policies(rows: Iterable[TrialRow]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -24,7 +23,7 @@ from fb3d_rl.camera.views import View, look_at
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.evaluation.film import Film, record
-from fb3d_rl.evaluation.rows import TrialRow
+from fb3d_rl.evaluation.rows import TrialRow, film_name
 from fb3d_rl.evaluation.tables import own_policy
 from fb3d_rl.evaluation.trials import Scheduled
 from fb3d_rl.flow.opening import standing_bounds
@@ -440,8 +439,7 @@ def film_trials(
     for done, row in enumerate(wanted):
         progress(done, len(wanted))
         film = record(row.policy, policies[row.policy], by_id[row.object], scheduled[row.trial].trial, options)
-        # Names in strangers' files may hold any character.
-        name = re.sub(r"[^\w.-]", "_", f"{row.trial:03d}_{row.object}_{row.link}_{row.policy}", flags=re.ASCII)
+        name = film_name(row)
         # All policies are seen from the same side.
         if row.trial not in views:
             views[row.trial] = Shot(film, *SIZE).view

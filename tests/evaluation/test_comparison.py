@@ -19,7 +19,8 @@ from scipy.stats import binomtest
 from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation import learning, tables
 from fb3d_rl.evaluation.comparison import COLUMNS, Comparison, Entry, compare
-from fb3d_rl.evaluation.report import write_comparison, write_report
+from fb3d_rl.evaluation.comparison_page import write_comparison
+from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rows import TrialRow, write_trials
 from fb3d_rl.evaluation.runs import find_runs, read_run
 from fb3d_rl.evaluation.tables import SUCCESS, difference, summary
@@ -432,7 +433,8 @@ def page(found: Comparison, tmp_path_factory: pytest.TempPathFactory) -> Page:
 
 def test_the_page_is_whole_and_loads_nothing(page: Page) -> None:
     for tag, attrs in page.tags:
-        assert not {"src", "href", "data", "action"} & set(attrs), (tag, attrs)
+        assert not {"src", "data", "action"} & set(attrs), (tag, attrs)
+        assert (attrs.get("href") or "#").startswith("#"), (tag, attrs)
         assert tag not in ("link", "iframe", "img", "base", "object", "embed")
     for id_ in page.figures:
         assert sum(attrs.get("id") == id_ for _, attrs in page.tags) == 1, id_
@@ -464,7 +466,7 @@ def test_names_from_outside_are_shown_not_run(tmp_path: Path) -> None:
         write_run(tmp_path / value[:3], "bc", 0, trials("bc", 0, skill), settings={"note": value})
     page = Page(write_comparison(compared(tmp_path), tmp_path / "out.html", [Path(evil)]))
     assert sum(evil in piece for piece in page.text) >= 5
-    assert sum(tag == "script" for tag, _ in page.tags) == len(page.figures) + 2  # plotly and the page's own
+    assert sum(tag == "script" for tag, _ in page.tags) == len(page.figures) + 3  # plotly and two of the page's own
 
 
 def test_the_csv_holds_every_number(found: Comparison, tmp_path: Path) -> None:

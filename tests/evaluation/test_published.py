@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,9 @@ def test_a_run_on_other_objects_is_refused(tmp_path: Path) -> None:
     write_flow(tmp_path / "flow_rows_all_parts.csv", [flow("Box", "1", 0.9, 0.1, "all")])
     with pytest.raises(UserError, match="train_test"):
         paper(read_run(tmp_path), "mask")
+
+
+def test_the_command_knows_all_published_networks() -> None:
+    variants = runpy.run_path(str(Path(__file__).parents[2] / "launch" / "report.py"))["VARIANTS"]
+    for split in PUBLISHED["flow"]["values"].values():
+        assert {*variants} == {*split}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import os
 import re
@@ -12,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.evaluation import report
+from fb3d_rl.evaluation import gallery
 from fb3d_rl.evaluation.comparison import compare
-from fb3d_rl.evaluation.report import write_comparison, write_report
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.comparison_page import write_comparison
+from fb3d_rl.evaluation.report import write_report
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, film_name, write_flow, write_trials
 from fb3d_rl.evaluation.runs import read_run
 from fb3d_rl.evaluation.tables import summary
 
@@ -137,7 +140,8 @@ def test_strings_from_outside_are_shown_not_run(page: Page) -> None:
 
 def test_nothing_is_loaded_from_elsewhere(run: Path, page: Page) -> None:
     for tag, attrs in page.tags:
-        assert not {"src", "href", "data", "action"} & set(attrs), (tag, attrs)
+        assert not {"src", "data", "action"} & set(attrs), (tag, attrs)
+        assert (attrs.get("href") or "#").startswith("#"), (tag, attrs)
         assert tag not in ("link", "iframe", "img", "base", "object", "embed")
     policy = next(a["content"] for t, a in page.tags if t == "meta" and "http-equiv" in a)
     assert policy is not None and "default-src 'none'" in policy and "http" not in policy
@@ -166,7 +170,7 @@ def test_missing_files_leave_no_empty_sections(tmp_path: Path) -> None:
     run = tmp_path / "run"
     fill(run)
     titles = {
-        "rows.csv": "Failed trials",
+        "rows.csv": "Trials",
         "clouds.npz": "True and predicted flow",
         "metrics.jsonl": "Training",
         "config.yaml": "Configuration",
@@ -191,20 +195,39 @@ def test_without_a_summary_it_is_computed_from_the_rows(run: Path, tmp_path: Pat
     assert f"{len(rows) // 2} trials on 7 objects, 1 crashed" in numbers
 
 
-def test_videos_stand_inside_the_page_while_they_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    fill(tmp_path / "run")
-    (tmp_path / "run" / "videos").mkdir()
-    for name in ("000_b", "000_a", "001_c"):
-        (tmp_path / "run" / "videos" / f"{name}.mp4").write_bytes(name.encode() * 20)
-    monkeypatch.setattr(report, "_VIDEO_BYTES", 250)
-    page = Page(write_report(tmp_path / "run"))
-    sources = [attrs["src"] for tag, attrs in page.tags if tag == "video"]
-    held = [base64.b64decode((source or "").removeprefix("data:video/mp4;base64,")) for source in sources]
-    assert held == [b"000_a" * 20, b"000_b" * 20]
+def test_films_stand_inside_the_page_while_they_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    rows = [row for row in fill(run) if row.trial in (3, 4, 5)]
+    (run / "videos").mkdir()
+    for row in rows:
+        (run / "videos" / f"{film_name(row)}.mp4").write_bytes(film_name(row).encode() * 20)
+        noise = np.random.default_rng(row.trial).integers(0, 255, (60, 400, 3), dtype=np.uint8)
+        Image.fromarray(noise).save(run / "videos" / f"{film_name(row)}.png")
+    names = [film_name(row) for row in rows]
+    monkeypatch.setattr(gallery, "VIDEO_BYTES", 20 * (len(names[0]) + len(names[1])) + 10)
+    monkeypatch.setattr(gallery, "STRIP_BYTES", 200_000)
+    page = Page(write_report(run))
+    sources = [attrs["src"] or "" for tag, attrs in page.tags if tag == "video"]
+    held = [base64.b64decode(source.removeprefix("data:video/mp4;base64,")) for source in sources]
+    assert held == [name.encode() * 20 for name in names[:2]]
+    strips = [attrs["src"] or "" for tag, attrs in page.tags if tag == "img"]
+    assert 0 < len(strips) < 4 and sum(map(len, strips)) < 4 / 3 * 200_000 + 100
+    for strip in strips:
+        with Image.open(io.BytesIO(base64.b64decode(strip.removeprefix("data:image/webp;base64,")))) as picture:
+            assert picture.size == (1200, 180)
     shown = " ".join(page.text)
-    assert "000_a" in shown and "1 more" in shown
-    policy = next(attrs["content"] for tag, attrs in page.tags if tag == "meta" and "http-equiv" in attrs)
-    assert policy is not None and "media-src data:" in policy
+    assert "Oven object-3" in shown and f"{4 - len(strips)} more" in shown
+    films = {attrs["id"]: attrs for tag, attrs in page.tags if tag == "figure"}
+    links = [attrs["href"] for tag, attrs in page.tags if tag == "a" and (attrs["href"] or "").startswith("#film-")]
+    assert links == [f"#{name}" for name in films] and len(films) == 2 + len(strips)
+
+
+def test_a_film_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    rows = fill(tmp_path / "run")
+    (tmp_path / "run" / "videos").mkdir()
+    (tmp_path / "run" / "videos" / f"{film_name(rows[-1])}.png").write_bytes(b"nonsense")
+    with pytest.raises(UserError, match="videos"):
+        write_report(tmp_path / "run")
 
 
 def test_writing_twice_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
