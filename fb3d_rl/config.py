@@ -300,6 +300,8 @@ class EvaluationConfig:
     Attributes:
         trials: at most this many, spread over the categories; null for all visible openable parts; 0 for none, which
             needs no simulator.
+        start: as goal and repeats of fb3d_rl.evaluation.trials.ScheduleOptions; conf/protocol/ sets the three.
+        decision_seconds: a trial whose policy takes longer for one decision ends there; null for no limit.
         expert: also run the expert on the same trials.
         clouds: clouds shown in the report.
         videos: trials filmed with every policy, spread over the categories, half of them failures if there are any.
@@ -309,6 +311,10 @@ class EvaluationConfig:
     expert: bool
     clouds: int
     videos: int
+    decision_seconds: float | None
+    start: str
+    goal: str
+    repeats: int
 
 
 @dataclass
@@ -350,9 +356,15 @@ class TrainConfig(CommandConfig):
 
 @dataclass
 class EvaluateConfig(CommandConfig):
-    """Everything that launch/evaluate.py needs; ``checkpoint`` is a file that launch/train.py wrote."""
+    """Everything that launch/evaluate.py needs.
+
+    Attributes:
+        checkpoint: a file that launch/train.py wrote.
+        resume: go on from the rows in the run folder.
+    """
 
     checkpoint: str | None
+    resume: bool
 
 
 def validate(cfg: CommandConfig) -> None:
@@ -398,6 +410,15 @@ def validate(cfg: CommandConfig) -> None:
     _at_least("evaluation.trials", 0 if cfg.evaluation.trials is None else cfg.evaluation.trials, 0)
     _at_least("evaluation.clouds", cfg.evaluation.clouds, 0)
     _at_least("evaluation.videos", cfg.evaluation.videos, 0)
+    _at_least("evaluation.repeats", cfg.evaluation.repeats, 1)
+    _one_of("evaluation.start", cfg.evaluation.start, ("reference", "closed", "random"))
+    _one_of("evaluation.goal", cfg.evaluation.goal, ("open", "state"))
+    if cfg.evaluation.decision_seconds is not None:
+        _positive("evaluation.decision_seconds", cfg.evaluation.decision_seconds)
+    if cfg.evaluation.goal == "state" and cfg.policy.name in ("bc", "dagger"):
+        raise UserError(
+            f"policy={cfg.policy.name} has learned to open; evaluation.goal=state is for policies of a flow"
+        )
     for key in ("closed_share", "others_closed", "all_parts_share", "some_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:
             raise UserError(f"data.{key}={getattr(cfg.data, key)} is no share; give a number from 0 to 1")

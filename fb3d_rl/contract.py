@@ -74,6 +74,7 @@ GROUPS: dict[str, dict[Key, Entry]] = {
         ("observation", "attached"): Entry((1,), BOOL, "suction holds a movable part"),
         ("observation", "contact_force"): Entry((1,), F32, "norm of the contact force on the gripper, N"),
         ("observation", "camera_position"): Entry((3,), F32, "where the depth camera stands in the world, m"),
+        ("observation", "goal_sense"): Entry((1,), F32, "1: the goal is to open the part, -1: to close it some way"),
     },
     "action": {
         "action": Entry((8,), F32, "velocities in [-1, 1]: x y z * v_max, r p y * w_max, fingers * f_max"),

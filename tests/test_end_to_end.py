@@ -6,14 +6,17 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
 from fb3d_rl.contract import UserError
-from fb3d_rl.evaluation.rows import read_trials
+from fb3d_rl.evaluation import evaluate as evaluation
+from fb3d_rl.evaluation.rows import read_trials, write_trials
 from fb3d_rl.training.run_log import RunLog, read_rows
 
 Config = Callable[[str, list[str]], Any]
@@ -118,6 +121,34 @@ def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_pat
 
 
 @pytest.mark.slow
+def test_an_interrupted_evaluation_goes_on_from_its_rows(
+    first: Path, tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [word for word in SMALL if not word.startswith("algo.")]
+    words += ["policy=artflownet", f"checkpoint={first / 'checkpoint.pt'}"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    expected = run_evaluation(config("evaluate", words), whole)
+    cut.mkdir()
+    (cut / "config.yaml").write_text(yaml.safe_dump(asdict(config("evaluate", words))))
+    write_trials(cut / "rows.csv", [expected[0], expected[1], expected[3]])
+    ran: list[int] = []
+    run_all = evaluation.run_trials
+
+    def counted(name: str, policy: Any, objects: Any, scheduled: list[Any], *rest: Any) -> Any:
+        ran.append(len(scheduled))
+        return run_all(name, policy, objects, scheduled, *rest)
+
+    monkeypatch.setattr(evaluation, "run_trials", counted)
+    assert run_evaluation(config("evaluate", [*words, "resume=true"]), cut) == expected
+    assert ran == [0, 1]
+    assert (cut / "rows.csv").read_bytes() == (whole / "rows.csv").read_bytes()
+    with pytest.raises(UserError, match=r"begun with env\.success=0\.1, not 0\.2"):
+        run_evaluation(config("evaluate", [*words, "resume=true", "env.success=0.2"]), cut)
+    write_trials(cut / "rows.csv", [replace(expected[0], trial=1)])
+    with pytest.raises(UserError, match="under number 1, which is not scheduled"):
+        run_evaluation(config("evaluate", [*words, "resume=true"]), cut)
+
+
 def test_training_and_flow_metrics_need_no_simulator(tmp_path: Path) -> None:
     launch = Path(CONF).parent / "launch"
     overrides = [item for item in SMALL if not item.startswith("evaluation.")]

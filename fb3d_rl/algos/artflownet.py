@@ -212,7 +212,7 @@ def load_network(path: str | Path) -> ArtFlowNet:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate the expert, or a trained ArtFlowNet beside the expert."""
-    protocol = setup.protocol(cfg)
+    protocol = setup.evaluation_protocol(cfg, out)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     net = load_network(cfg.checkpoint) if cfg.policy.name == "artflownet" and cfg.checkpoint else None
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))

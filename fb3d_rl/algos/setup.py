@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import torch
+import yaml
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import Entry, partnet_catalog, procedural_catalog
@@ -21,6 +22,7 @@ from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.trials import ScheduleOptions
 from fb3d_rl.evaluation.video import require_encoder
 from fb3d_rl.perception.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
@@ -28,7 +30,7 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, CommandConfig
+    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig
 
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
@@ -134,7 +136,39 @@ def protocol(cfg: CommandConfig) -> Protocol:
         clouds=cfg.evaluation.clouds,
         videos=cfg.evaluation.videos,
         seed=cfg.seed,
+        schedule=ScheduleOptions(
+            cast(Literal["reference", "closed", "random"], cfg.evaluation.start),
+            cast(Literal["open", "state"], cfg.evaluation.goal),
+            cfg.evaluation.repeats,
+        ),
+        decision_seconds=cfg.evaluation.decision_seconds,
     )
+
+
+def evaluation_protocol(cfg: EvaluateConfig, out: Path) -> Protocol:
+    """What launch/evaluate.py evaluates.
+
+    Raises:
+        UserError: as :func:`protocol`; or it is to go on from an evaluation with other settings.
+    """
+    if cfg.resume and (out / "config.yaml").is_file():
+        before, now = (_flat(c) for c in (yaml.safe_load((out / "config.yaml").read_text()), asdict(cfg)))
+        for key, value in now.items():
+            # Where trials run changes no row.
+            if before.get(key) != value and key != "resume" and not key.startswith("collector."):
+                raise UserError(
+                    f"{out} was begun with {key}={before.get(key)}, not {value}; resume with the same settings, or "
+                    "choose another folder: hydra.run.dir=DIR"
+                )
+    return replace(protocol(cfg), resume=cfg.resume)
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Leaves of nested dicts by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in tree.items():
+        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
 
 
 def choose_device(name: str) -> torch.device:

@@ -116,6 +116,7 @@ class Trial:
         start: joint state [J] (rad or m) in the order of the object's ``movable``.
         view: where the camera stands.
         seed: of the random draws within the episode.
+        goal: position (rad or m) that the part's joint is to reach; None for fully open.
     """
 
     object: str
@@ -123,6 +124,7 @@ class Trial:
     start: tuple[float, ...]
     view: View
     seed: int = 0
+    goal: float | None = None
 
 
 def default_trial(
@@ -131,6 +133,7 @@ def default_trial(
     view: View | None = None,
     seed: int = 0,
     fraction: float | None = None,
+    goal: float | None = None,
 ) -> Trial:
     """The trial of the reference protocol: everything closed but the part to open, 20 % open in some categories.
 
@@ -140,6 +143,7 @@ def default_trial(
         view: the camera's view; from the front and 30 degrees above unless given.
         seed: of the random draws within the episode.
         fraction: how far the part is open at the start, where it is not the protocol's.
+        goal: how far it is to be open at the end, a fraction, too; None for fully.
 
     Raises:
         UserError: nothing of the object can be opened.
@@ -153,4 +157,5 @@ def default_trial(
     start = closed.copy()
     j = obj.movable.index(link)
     start[j] += (start_fraction(obj.category) if fraction is None else fraction) * (opened[j] - closed[j])
-    return Trial(obj.id, link, tuple(float(q) for q in start), view or View(0.0, 30.0), seed)
+    wanted = None if goal is None else float(closed[j] + goal * (opened[j] - closed[j]))
+    return Trial(obj.id, link, tuple(float(q) for q in start), view or View(0.0, 30.0), seed, wanted)

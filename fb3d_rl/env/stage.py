@@ -165,7 +165,8 @@ class Stage:
         trial: the running trial.
         model: its object.
         target: position of the part's joint in a joint state [J].
-        goal: position (rad or m) of that joint when it is open.
+        goal: position (rad or m) that this joint is to reach: the trial's, or that in which it is open.
+        sense: +1 if the goal lies where the joint opens, -1 if the part has to be closed to get there.
         sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
         moved: [L] bool, the links that the joint carries.
         direction: [J], ``sign`` at the target and 0 elsewhere.
@@ -192,10 +193,13 @@ class Stage:
                 f"its movable links are {obj.movable}"
             )
         self.trial, self.model, self.target = trial, model, obj.movable.index(trial.link)
-        self.goal = float(model.opened[self.target])
-        if abs(self.goal - trial.start[self.target]) < 1e-6:
-            raise UserError(f"object {obj.id}: link {trial.link} starts fully open; choose another start or link")
-        self.sign = 1.0 if self.goal > trial.start[self.target] else -1.0
+        opened, start = float(model.opened[self.target]), trial.start[self.target]
+        self.goal = opened if trial.goal is None else trial.goal
+        if abs(self.goal - start) < 1e-6:
+            where = "fully open" if trial.goal is None else "at its goal"
+            raise UserError(f"object {obj.id}: link {trial.link} starts {where}; choose another start or link")
+        self.sign = 1.0 if opened > float(model.closed[self.target]) else -1.0
+        self.sense = self.sign if self.goal > start else -self.sign
         self.moved = model.tree.descendants[self.target]
         self.direction = torch.zeros(len(obj.movable), dtype=torch.float64)
         self.direction[self.target] = self.sign

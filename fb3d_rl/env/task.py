@@ -424,6 +424,7 @@ class OpenArticulatedEnv(BaseEnv):
                 "attached": self._tensor([[stage.suction.attached] for stage in self.stages]),
                 "contact_force": self._force.clone(),
                 "camera_position": self._camera_position.clone(),
+                "goal_sense": self._tensor([[stage.sense] for stage in self.stages]).float(),
             },
             "privileged": {
                 "joint_axis": truth[:, :3],

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.workers import CollectorOptions
@@ -23,9 +24,9 @@ from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
 from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
+from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
 from fb3d_rl.evaluation.tables import show, summary
-from fb3d_rl.evaluation.trials import Scheduled, schedule
+from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
 from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.files import write_text
 from fb3d_rl.flow.metrics import flow_metrics
@@ -45,6 +46,9 @@ class Protocol:
         clouds: clouds kept for the report.
         videos: trials filmed with every policy, 0 for none.
         seed: base seed of trials and samples.
+        schedule: starts, goals and repetitions of the trials.
+        decision_seconds: time limit of a decision, s; None for none.
+        resume: go on from the rows that the run folder holds.
     """
 
     samples: SampleOptions
@@ -55,6 +59,9 @@ class Protocol:
     clouds: int
     videos: int
     seed: int
+    schedule: ScheduleOptions = ScheduleOptions()
+    decision_seconds: float | None = None
+    resume: bool = False
 
 
 def evaluate(
@@ -80,6 +87,9 @@ def evaluate(
 
     Returns:
         One row for each scheduled trial and policy.
+
+    Raises:
+        UserError: it is to go on from rows of other trials.
     """
     numbers: dict[str, Any] = dict(facts)
     measured: list[FlowRow] = []
@@ -89,16 +99,22 @@ def evaluate(
         write_flow(out / "flow_rows.csv", measured)
     scheduled: list[Scheduled] = []
     if protocol.trials != 0:
-        scheduled, numbers["n_hidden_parts"] = schedule(objects, protocol.samples, protocol.seed, protocol.trials)
+        scheduled, numbers["n_hidden_parts"] = schedule(
+            objects, protocol.samples, protocol.seed, protocol.trials, protocol.schedule
+        )
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
+    before = read_trials(out / "rows.csv") if protocol.resume and (out / "rows.csv").is_file() else []
     rows: list[TrialRow] = []
     with progress_bars() as bar:
         for name, policy in policies.items() if scheduled else ():
-            task = bar.add_task(f"trials: {name}", total=len(scheduled))
-            advance = partial(_advance, bar, task)
-            rows += run_trials(name, policy, shown, scheduled, protocol.env, advance, protocol.collector)
-            write_trials(out / "rows.csv", rows)
+            done = _done(name, before, scheduled)
+            task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
+            keep = partial(_keep, out / "rows.csv", rows, done, lambda: bar.advance(task))  # noqa: B023, used at once
+            timing = _run(name, policy, shown, scheduled, protocol, done, keep)
+            rows += [done[number] for number in sorted(done)]
+            if timing:
+                numbers[f"{name}/time/decision_ms"] = 1000 * float(np.median(timing))
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())
@@ -123,8 +139,49 @@ def progress_bars() -> Progress:
     return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 
-def _advance(bar: Progress, task: TaskID, row: TrialRow) -> None:
-    bar.advance(task)
+def _done(policy: str, rows: Sequence[TrialRow], scheduled: Sequence[Scheduled]) -> dict[int, TrialRow]:
+    """The trials that a policy has run already, by their numbers.
+
+    Raises:
+        UserError: a row is of another trial than is scheduled under its number.
+    """
+    done = {row.trial: row for row in rows if row.policy == policy}
+    for number, row in done.items():
+        item = scheduled[number] if number < len(scheduled) else None
+        if item is None or (row.object, row.link, row.seed) != (item.trial.object, item.link, item.trial.seed):
+            raise UserError(
+                f"rows.csv holds a trial of {row.category} {row.object} under number {number}, which is not scheduled; "
+                "resume with the settings it was started with, or choose another folder: hydra.run.dir=DIR"
+            )
+    return done
+
+
+def _run(
+    name: str,
+    policy: TensorDictModuleBase,
+    objects: Sequence[ArticulatedObject],
+    scheduled: Sequence[Scheduled],
+    protocol: Protocol,
+    done: Mapping[int, TrialRow],
+    keep: Callable[[TrialRow], None],
+) -> list[float]:
+    """Run the trials that are not done; each row goes to ``keep``. Returns the seconds that each decision took."""
+    left = [number for number in range(len(scheduled)) if number not in done]
+    timing: list[float] = []
+    run_trials(
+        name, policy, objects, [scheduled[number] for number in left], protocol.env,
+        lambda row: keep(replace(row, trial=left[row.trial])), protocol.collector, protocol.decision_seconds, timing,
+    )  # fmt: skip
+    return timing
+
+
+def _keep(
+    path: Path, before: Sequence[TrialRow], done: dict[int, TrialRow], advance: Callable[[], None], row: TrialRow
+) -> None:
+    """Put a row among those of its policy, and all rows on disk."""
+    done[row.trial] = row
+    write_trials(path, [*before, *(done[number] for number in sorted(done))])
+    advance()
 
 
 def _measure_flow(

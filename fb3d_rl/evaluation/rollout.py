@@ -17,11 +17,25 @@ from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers
-from fb3d_rl.evaluation.rows import TrialRow
+from fb3d_rl.evaluation.decisions import DECISION, TimedPolicy, TookTooLong
+from fb3d_rl.evaluation.rows import (
+    CRASHED,
+    LOST,
+    NEVER_HELD,
+    NEVER_TOUCHED,
+    STUCK,
+    TIMED_OUT,
+    TOO_SLOW,
+    WRONG_WAY,
+    TrialRow,
+)
 from fb3d_rl.evaluation.trials import Scheduled
 from fb3d_rl.policies.flow_policy import FlowPolicy
 
 KEYS: tuple[Key, ...] = (
+    ("observation", "tool_pose"),
+    ("next", "observation", "tool_pose"),
+    DECISION,
     ("next", "success"),
     ("next", "normalized_distance"),
     ("next", "contact"),
@@ -85,11 +99,13 @@ def run_trials(
     options: EnvOptions,
     progress: Callable[[TrialRow], None] = lambda row: None,
     collector: CollectorOptions | None = None,
+    limit: float | None = None,
+    timing: list[float] | None = None,
 ) -> list[TrialRow]:
     """Run every trial once.
 
-    A trial that crashes becomes a row with status "error" and counts as a failure; the others are not touched by it.
-    The rows do not depend on the backend and the number of workers.
+    A trial that crashes, or whose policy takes too long, becomes a row with status "error" and counts as a failure;
+    the others are not touched by it. The rows do not depend on the backend and the number of workers.
 
     Args:
         name: the policy's name in the rows.
@@ -99,15 +115,20 @@ def run_trials(
         options: the task's constants.
         progress: called with each row.
         collector: where the trials run; in this process unless given.
+        limit: seconds that a decision may take (:class:`~fb3d_rl.evaluation.decisions.TimedPolicy`); None for no limit.
+        timing: takes the seconds that each decision took, in any order.
 
     Returns:
         One row per trial, in the order of ``scheduled``.
     """
     rows: dict[int, TrialRow] = {}
     create = partial(create_env, tuple(objects), options, state_of(policy))
-    with Workers(create, policy, collector or CollectorOptions(), options.horizon) as workers:
+    timed = TimedPolicy(policy, limit)
+    with Workers(create, timed, collector or CollectorOptions(), options.horizon) as workers:
         for episode in workers.run([item.trial for item in scheduled], KEYS):
-            row = _row(episode, name, scheduled[episode.index])
+            row = _row(episode, name, scheduled[episode.index], options)
+            if timing is not None and episode.frames is not None:
+                timing += episode.frames[DECISION].flatten().tolist()
             rows[episode.index] = row
             progress(row)
     return [rows[i] for i in range(len(scheduled))]
@@ -118,36 +139,48 @@ def create_env(objects: Sequence[ArticulatedObject], options: EnvOptions, state:
     return policy_env(make_env(objects, options), state)
 
 
-def _row(episode: Episode, name: str, item: Scheduled) -> TrialRow:
+def _row(episode: Episode, name: str, item: Scheduled, options: EnvOptions) -> TrialRow:
     trial = item.trial
-    outcome = (
-        dict(status="error", error=episode.error, failure="crashed")
-        if episode.frames is None
-        else _outcome(episode.frames["next"])
-    )
+    if episode.frames is None:
+        failure = TOO_SLOW if episode.error.startswith(TookTooLong.__name__) else CRASHED
+        outcome: dict[str, Any] = dict(status="error", error=episode.error, failure=failure)
+    else:
+        outcome = _outcome(episode.frames, options.control_freq)
     return TrialRow(
         trial=episode.index, policy=name, object=trial.object, category=item.category, split=item.split, link=item.link,
-        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, **outcome,
+        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, repeat=item.repeat, **outcome,
     )  # fmt: skip
 
 
-def _outcome(after: TensorDictBase) -> dict[str, Any]:
-    """What a row says about an episode, of what each of its steps led to [T]."""
+def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
+    """What a row says about the steps [T] of an episode."""
+    after = frames["next"]
+    attached = after["observation", "attached"].flatten()
     held = after["contact"].flatten().nonzero().flatten()
-    success, distance = bool(after["success"][-1]), float(after["normalized_distance"][-1])
-    if success:
-        failure = ""
-    elif len(held):
-        attached = bool(after["observation", "attached"][-1])
-        failure = "held, but not opened far enough" if attached else "lost hold"
-    else:
-        touched = bool((after["observation", "contact_force"] > 0).any())
-        failure = "touched, but never held the part" if touched else "never touched the part"
+    success, distance = bool(after["success"][-1]), after["normalized_distance"].flatten()
+    tips = torch.cat([frames["observation", "tool_pose"][:1], after["observation", "tool_pose"]])[..., :3].flatten(1)
     return dict(
         steps=len(after),
         contact=len(held) > 0,
         success=success,
-        normalized_distance=distance,
+        normalized_distance=float(distance[-1]),
         attach_step=int(held[0]) if len(held) else -1,
-        failure=failure,
+        failure="" if success else _failure(after, len(held) > 0, control_freq),
+        seconds=len(after) / control_freq,
+        path_length=float(tips.double().diff(dim=0).norm(dim=1).sum()),
+        lost=int((attached[:-1] & ~attached[1:]).sum()),
     )
+
+
+def _failure(after: TensorDictBase, held: bool, control_freq: int) -> str:
+    """Why the part was not opened in an episode; see :data:`~fb3d_rl.evaluation.rows.FAILURES`."""
+    if not held:
+        touched = bool((after["observation", "contact_force"] > 0).any())
+        return NEVER_HELD if touched else NEVER_TOUCHED
+    if not bool(after["observation", "attached"][-1]):
+        return LOST
+    distance = after["normalized_distance"].flatten()
+    if distance[-1] > 1.01:
+        return WRONG_WAY
+    still = len(distance) <= control_freq or distance[-1 - control_freq] - distance[-1] < 0.01
+    return STUCK if still else TIMED_OUT

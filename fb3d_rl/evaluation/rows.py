@@ -10,12 +10,32 @@ import io
 import math
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import MISSING, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from fb3d_rl.contract import UserError
 from fb3d_rl.files import write_text
+
+NEVER_TOUCHED = "never touched the part"
+NEVER_HELD = "touched, but never held the part"
+LOST = "lost hold"
+WRONG_WAY = "wrong direction"
+STUCK = "stuck"
+TIMED_OUT = "timed out"
+CRASHED = "crashed"
+TOO_SLOW = "took too long"
+FAILURES = {
+    NEVER_TOUCHED: "the gripper met nothing",
+    NEVER_HELD: "it met something, but suction never held the part",
+    LOST: "suction held the part, but not at the end",
+    WRONG_WAY: "held at the end, farther from the goal than at the start (by more than 1 % of the way)",
+    STUCK: "held at the end, and moved by less than 1 % of the way in the last second",
+    TIMED_OUT: "held at the end and still moving",
+    CRASHED: "an exception or a dead process ended the trial",
+    TOO_SLOW: "one decision of the policy took longer than evaluation.decision_seconds",
+}
+"""Why a part was not opened, with what that means."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +59,11 @@ class TrialRow:
         success: normalized distance below 0.1 at the end.
         normalized_distance: |q_goal - q| / |q_goal - q_start| at the end.
         attach_step: control step at which suction took hold, -1 if never.
-        failure: short reason why the part was not opened, "" on success.
+        failure: one of :data:`FAILURES`, "" on success.
+        repeat: which of the repetitions of a protocol that has several.
+        seconds: simulated time until success, else until the end, s; -1 if it was not recorded.
+        path_length: way of the suction tip, m; -1 if it was not recorded.
+        lost: how often the part was held and then was not; -1 if it was not recorded.
 
     Raises:
         ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success
@@ -63,6 +87,10 @@ class TrialRow:
     normalized_distance: float = 1.0
     attach_step: int = -1
     failure: str = ""
+    repeat: int = 0
+    seconds: float = -1.0
+    path_length: float = -1.0
+    lost: int = -1
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):
@@ -119,15 +147,18 @@ def _write(path: Path, rows: Sequence[Row], kind: type[Row]) -> None:
 
 def _read(path: Path, kind: type[Row]) -> list[Row]:
     columns = {field.name: str(field.type) for field in fields(kind)}
+    needed = [field.name for field in fields(kind) if field.default is MISSING]
     rows: list[Row] = []
     try:
         with path.open(newline="", encoding="utf-8", errors="surrogateescape") as file:
             reader = csv.reader(file)
-            if next(reader, None) != list(columns):
+            found = next(reader, [])
+            # Files of earlier versions lack what came later, which has a default.
+            if found != [name for name in columns if name in found] or not set(needed) <= set(found):
                 raise UserError(f"{path} is of another version: its columns must be {', '.join(columns)}.")
             for values in reader:
-                parsed = (_parse(value, type_) for value, type_ in zip(values, columns.values(), strict=True))
-                rows.append(kind(*parsed))
+                pairs = zip(found, values, strict=True)
+                rows.append(kind(**{name: _parse(value, columns[name]) for name, value in pairs}))
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise UserError(f"Cannot read {path}, row {len(rows) + 1}: {error}") from error
     return rows

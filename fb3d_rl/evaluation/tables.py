@@ -81,6 +81,12 @@ SUCCESS = Metric("success_rate", "success", "success", percent=True, proportion=
 MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, proportion=True)
 DISTANCE = Metric("normalized_distance", "normalized distance", "dist.", percent=False, proportion=True)
 TRIAL = (CONTACT, SUCCESS, MOTION_ONLY, DISTANCE)
+STEPS = Metric("steps_to_success", "steps to success", "steps", percent=False, proportion=False)
+SECONDS = Metric("seconds_to_success", "simulated seconds to success", "seconds", percent=False, proportion=False)
+PATH = Metric("path_length", "way of the tip, m", "way", percent=False, proportion=False)
+LOST = Metric("times_lost", "times that hold was lost", "lost", percent=False, proportion=False)
+EFFORT = (STEPS, SECONDS, PATH, LOST)
+"""What it took; of rows that were recorded before these numbers there are none."""
 
 _VALUES: dict[str, Callable[[Any], float | None]] = {
     "flow/cosine": lambda row: row.cosine,
@@ -90,6 +96,10 @@ _VALUES: dict[str, Callable[[Any], float | None]] = {
     "success_rate": lambda row: float(row.success),
     "motion_only_success_rate": lambda row: float(row.success) if row.contact else None,
     "normalized_distance": lambda row: row.normalized_distance,
+    "steps_to_success": lambda row: float(row.steps) if row.success else None,
+    "seconds_to_success": lambda row: row.seconds if row.success and row.seconds >= 0 else None,
+    "path_length": lambda row: row.path_length if row.path_length >= 0 else None,
+    "times_lost": lambda row: float(row.lost) if row.lost >= 0 else None,
 }
 """What a row contributes to each metric; None: this row does not count."""
 
@@ -219,7 +229,7 @@ def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | Non
             "n_objects": len({(row.category, row.object) for row in of_policy}),
             "n_error": sum(row.status == "error" for row in of_policy),
         }
-        measured = _measure(of_policy, TRIAL, "", classes) | counts
+        measured = _measure(of_policy, TRIAL + EFFORT, "", classes) | counts
         if policy == own:
             out |= measured
         out |= {f"{policy}/{key}": value for key, value in measured.items()}
@@ -244,7 +254,7 @@ def summary(
             the run's own policy, otherwise :func:`own_policy` chooses.
 
     Returns:
-        A flat dict. Each metric m of :data:`FLOW` and :data:`TRIAL` has the keys "m" (instance mean),
+        A flat dict. Each metric m of :data:`FLOW`, :data:`TRIAL` and :data:`EFFORT` has the keys "m" (instance mean),
         "m_ci95" ([lo, hi] or None), "m_class_mean" and "m_class_mean_ci95". Trial metrics and the counts "n"
         (scheduled trials), "n_objects" and "n_error" stand there for the run's own policy, and once more as
         "<policy>/..." for every policy. "by_category" (without class means) and, for more than one split,

@@ -6,6 +6,7 @@ import itertools
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -26,25 +27,61 @@ class Scheduled:
     link: str
     semantic: str
     joint_type: str
+    repeat: int = 0
+
+
+@dataclass(frozen=True)
+class ScheduleOptions:
+    """How trials start, what their goal is, and how often each is repeated.
+
+    Attributes:
+        start: how far the part is open at the start: "reference" (20 % in some categories, else closed), "closed",
+            "random" (uniform, up to 90 %).
+        goal: "open", fully (UMPNet's exploration), or "state", a joint state that is drawn at least 30 % of the range
+            away from the start, which is random then, towards opening or closing (UMPNet's manipulation).
+        repeats: trials of each part, each with a view and a seed of its own.
+    """
+
+    start: Literal["reference", "closed", "random"] = "reference"
+    goal: Literal["open", "state"] = "open"
+    repeats: int = 1
+
+    def draw(self, rng: np.random.Generator) -> dict[str, float | None]:
+        """Start and goal of a trial, for :func:`~fb3d_rl.env.options.default_trial`."""
+        if self.goal == "state":
+            start, goal = rng.random(2)
+            while abs(goal - start) < 0.3:
+                start, goal = rng.random(2)
+            return {"fraction": float(start), "goal": float(goal)}
+        if self.start == "random":
+            return {"fraction": 0.9 * float(rng.random())}
+        return {"fraction": 0.0 if self.start == "closed" else None}
 
 
 def schedule(
-    objects: Sequence[tuple[ArticulatedObject, str]], options: SampleOptions, seed: int, limit: int | None = None
+    objects: Sequence[tuple[ArticulatedObject, str]],
+    options: SampleOptions,
+    seed: int,
+    limit: int | None = None,
+    how: ScheduleOptions | None = None,
 ) -> tuple[list[Scheduled], int]:
     """List one trial for every part that opens and can be seen.
 
     The view of a trial is drawn from ``options.views`` until the part shows at least ``MIN_VISIBLE`` points, eight
-    times at most. A trial depends on (seed, object, link) alone, not on the other objects.
+    times at most. A trial depends on (seed, object, link, repetition) alone, not on the other objects.
 
     Args:
         objects: objects with their splits.
         options: points of a cloud, views and camera.
         seed: base seed.
         limit: at most this many trials, taken from the categories in turn.
+        how: starts, goals and repetitions; the reference's, once, unless given.
 
     Returns:
-        The trials, by category, object and link, and how many openable parts no view showed.
+        The trials, by category, object, link and repetition, and how many were left out because no view showed the
+        part.
     """
+    how = how or ScheduleOptions()
     found: dict[str, list[Scheduled]] = {}
     hidden = 0
     order = np.random.default_rng([seed, 2]).permutation(len(objects)).tolist()
@@ -52,25 +89,34 @@ def schedule(
         if limit is not None and len(found.get(obj.category, ())) >= limit:
             continue
         view = ObjectView(obj, options.camera)
-        for link in view.openable:
-            trial = _visible_trial(view, link, options, seed)
+        for link, repeat in itertools.product(view.openable, range(how.repeats)):
+            trial = _visible_trial(view, link, options, seed, how, repeat)
             if trial is None:
                 hidden += 1
                 continue
             part = obj.links[link]
-            item = Scheduled(trial, obj.category, split, part.name, part.semantic, obj.joint_of(link).type)
+            item = Scheduled(trial, obj.category, split, part.name, part.semantic, obj.joint_of(link).type, repeat)
             found.setdefault(obj.category, []).append(item)
     turns = itertools.chain.from_iterable(itertools.zip_longest(*(found[c] for c in sorted(found))))
     chosen = [item for item in turns if item is not None][:limit]
-    return sorted(chosen, key=lambda s: (s.category, s.trial.object, s.trial.link)), hidden
+    return sorted(chosen, key=lambda s: (s.category, s.trial.object, s.trial.link, s.repeat)), hidden
 
 
-def _visible_trial(view: ObjectView, link: int, options: SampleOptions, seed: int, tries: int = 8) -> Trial | None:
-    rng = np.random.default_rng([seed, 3, zlib.crc32(view.obj.id.encode()), link])
+def _visible_trial(
+    view: ObjectView,
+    link: int,
+    options: SampleOptions,
+    seed: int,
+    how: ScheduleOptions = ScheduleOptions(),
+    repeat: int = 0,
+    tries: int = 8,
+) -> Trial | None:
+    rng = np.random.default_rng([seed, 3, zlib.crc32(view.obj.id.encode()), link, *[repeat] * (repeat > 0)])
     number = int(rng.integers(2**31))
+    drawn = how.draw(rng)
     carried = view.obj.descendants(link)
     for _ in range(tries):
-        trial = default_trial(view.obj, link, options.views.sample(rng), number)
+        trial = default_trial(view.obj, link, options.views.sample(rng), number, **drawn)
         _, links = view.cloud(np.array(trial.start), trial.view, options.points, rng)
         if np.isin(links, carried).sum() >= MIN_VISIBLE:
             return trial

@@ -154,7 +154,7 @@ class FlowPolicy(TensorDictModuleBase):
         self.limits = limits
         self.options = options or FlowPolicyOptions()
         observed = ("points", "valid", "part_mask", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
-        self.in_keys = [("observation", key) for key in observed] + [flow_key]
+        self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
         self.in_keys += [("policy", key) for key in self.STATE]
         self.out_keys = ["action"] + [("next", "policy", key) for key in self.STATE]
 
@@ -172,13 +172,14 @@ class FlowPolicy(TensorDictModuleBase):
         axis = hand_axis(tool_pose)
         tips, hands = _numbers(tool_pose[:, :3]), _numbers(axis)
         attached, force = obs["attached"].flatten().tolist(), obs["contact_force"].flatten().tolist()
+        senses = obs["goal_sense"].flatten().tolist()
         memories = _recall(tensordict["policy"])
         pulled = [memory.phase == PULL for memory in memories]
 
         for i, memory in enumerate(memories):
-            self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force)
+            self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force, senses[i])
         self._choose(memories, obs, axis, flow)
-        pulls = self._flow_at(memories, obs, flow)
+        pulls = self._flow_at(memories, obs, flow, senses)
         clouds = self._clouds(memories, obs)
 
         twists = np.empty((len(memories), 6))
@@ -188,7 +189,7 @@ class FlowPolicy(TensorDictModuleBase):
                     # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
                     memory.standoff = rotate(memory.standoff, alignment(memory.pull, pulls[i]))
                 memory.pull = pulls[i]
-                velocity = self.options.pull_speed * memory.pull
+                velocity = senses[i] * self.options.pull_speed * memory.pull
             elif memory.phase == TRAVEL:
                 velocity = self._travel(memory, tip, clouds[i])
             else:
@@ -200,7 +201,7 @@ class FlowPolicy(TensorDictModuleBase):
         tensordict["next", "policy"] = self._state(memories, tensordict.device)
         return tensordict
 
-    def _advance(self, memory: Memory, tip: Vector, hand: Vector, attached: bool, touches: bool) -> None:
+    def _advance(self, memory: Memory, tip: Vector, hand: Vector, attached: bool, touches: bool, sense: float) -> None:
         """Move on to the phase that the observation calls for."""
         o, m = self.options, memory
         moved, came = tip - m.tip, m.came
@@ -230,7 +231,7 @@ class FlowPolicy(TensorDictModuleBase):
                 m.give_up(m.contact_point)
                 m.phase, m.leave = RETREAT, m.standoff
         elif m.phase == PULL:
-            m.idle = m.idle + 1 if attached and moved @ m.pull < o.stuck_progress else 0
+            m.idle = m.idle + 1 if attached and sense * (moved @ m.pull) < o.stuck_progress else 0
             if not attached:
                 # It backs off from where it is, not from a contact point that is far away.
                 m.phase, m.leave, m.contact_point, m.standoff = RETREAT, m.standoff, tip, hand
@@ -367,7 +368,9 @@ class FlowPolicy(TensorDictModuleBase):
         near = (nearest < self.options.free) & (nearest < np.linalg.norm(offset, axis=-1) - 0.01)
         return int(near.sum()) > 1
 
-    def _flow_at(self, memories: list[Memory], obs: TensorDictBase, flow: Tensor) -> dict[int, Vector]:
+    def _flow_at(
+        self, memories: list[Memory], obs: TensorDictBase, flow: Tensor, senses: list[float]
+    ) -> dict[int, Vector]:
         """Unit flow at the held point of each environment that pulls, ``lead`` ahead; the last one where none is seen.
 
         The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the
@@ -388,7 +391,7 @@ class FlowPolicy(TensorDictModuleBase):
         for i, at_tip, omega in zip(rows, *map(_numbers, motion), strict=True):
             speed = length(at_tip)
             unit = normalize(at_tip)
-            rate = o.lead * o.pull_speed / max(speed, 1e-6) * omega
+            rate = senses[i] * o.lead * o.pull_speed / max(speed, 1e-6) * omega
             found[i] = normalize(unit + cross(rate, unit)) if speed > 1e-6 else memories[i].pull
         return found
 

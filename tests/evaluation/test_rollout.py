@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets import procedural
@@ -17,11 +19,12 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions
-from fb3d_rl.evaluation.rollout import run_trials
+from fb3d_rl.evaluation.rollout import _outcome, run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
+from fb3d_rl.flow.opening import openable_links
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 
@@ -122,3 +125,107 @@ def test_worker_processes_give_the_same_rows_and_a_dead_one_costs_its_trial_only
     assert sorted(seen) == list(range(len(trials)))
     assert again[1].status == "error" and "signal 9" in again[1].error and again[1].failure == "crashed"
     assert again[:1] + again[2:] == rows[:1] + rows[2:]
+
+
+class Late:
+    """Stands still, and hangs from its ``first`` call on; can be pickled."""
+
+    def __init__(self, seconds: float, first: int) -> None:
+        self.seconds, self.first = seconds, first
+
+    def __call__(self, call: int) -> torch.Tensor:
+        if call >= self.first:
+            time.sleep(self.seconds)
+        return torch.zeros(8)
+
+
+@pytest.mark.parametrize("backend", ["direct", "process"])
+def test_a_policy_that_hangs_costs_its_own_trial(
+    backend: Literal["direct", "process"], objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    options = EnvOptions(points=300, camera=CAMERA, horizon=3)
+    started = time.perf_counter()
+    timing: list[float] = []
+    rows = run_trials("late", Policy(Late(60.0, first=8)), objects, trials[:4], options,
+                      collector=CollectorOptions(backend, 1), limit=0.5, timing=timing)  # fmt: skip
+    assert time.perf_counter() - started < 50
+    assert [row.status for row in rows] == ["ok", "ok", "error", "error"]
+    assert {row.failure for row in rows[2:]} == {"took too long"} and "0.5 s" in rows[2].error
+    assert len(timing) == 6 and 0 < max(timing) < 0.5
+
+
+class Deaf(Late):
+    """Hangs where no exception reaches it."""
+
+    def __call__(self, call: int) -> torch.Tensor:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGALRM])
+        return super().__call__(call)
+
+
+@pytest.mark.slow
+def test_a_policy_that_hangs_in_a_library_costs_its_worker(
+    objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    options = EnvOptions(points=300, camera=CAMERA, horizon=3)
+    rows = run_trials("deaf", Policy(Deaf(120.0, first=5)), objects, trials[:3], options,
+                      collector=CollectorOptions("process", 1), limit=0.5)  # fmt: skip
+    assert [row.status for row in rows] == ["ok", "error", "ok"] and "exit code 1" in rows[1].error
+
+
+def test_a_policy_that_answers_nan_fails_its_trial(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
+    policy = Policy(lambda call: torch.full((8,), float("nan") if call == 2 else 0.0))
+    options = EnvOptions(points=300, camera=CAMERA, horizon=3)
+    rows = run_trials("nan", policy, objects, trials[:2], options)
+    assert [row.failure for row in rows] == ["crashed", "never touched the part"] and "nan" in rows[0].error
+
+
+def frames(distance: list[float], contact: list[bool], attached: list[bool], force: float = 1.0) -> TensorDict:
+    """An episode whose tip goes 1 cm a step."""
+    steps = len(distance)
+    pose = torch.zeros(steps + 1, 7)
+    pose[:, 0] = 0.01 * torch.arange(steps + 1)
+
+    def column(values: list[Any]) -> torch.Tensor:
+        return torch.tensor(values)[:, None]
+
+    seen = {"tool_pose": pose[1:], "attached": column(attached), "contact_force": column([force] * steps)}
+    after = {
+        "success": column([d < 0.1 for d in distance]),
+        "normalized_distance": column(distance),
+        "contact": column(contact),
+        "observation": seen,
+    }
+    return TensorDict({"observation": {"tool_pose": pose[:-1]}, "next": after}, batch_size=[steps])
+
+
+def test_why_trials_fail() -> None:
+    held, no = [True] * 40, [False] * 40
+    slowly = [1.0 - 0.01 * k for k in range(40)]
+    for expected, episode in {
+        "never touched the part": frames([1.0] * 40, no, no, force=0.0),
+        "touched, but never held the part": frames([1.0] * 40, no, no),
+        "lost hold": frames([0.5] * 40, held, [True] * 39 + [False]),
+        "stuck": frames(slowly[:10] + [0.9] * 30, held, held),
+        "timed out": frames(slowly, held, held),
+        "wrong direction": frames([1.0 + 0.01 * k for k in range(40)], held, held),
+        "": frames([*slowly[:-1], 0.05], held, held),
+    }.items():
+        assert _outcome(episode, control_freq=20)["failure"] == expected
+    blinking = [k % 10 > 4 for k in range(40)]
+    outcome = _outcome(frames(slowly, held, blinking), control_freq=20)
+    assert outcome["lost"] == 3 and outcome["seconds"] == 2.0
+    assert outcome["path_length"] == pytest.approx(0.4)
+
+
+def test_a_goal_on_either_side_is_reached_by_the_flow_and_its_inverse(
+    objects: list[ArticulatedObject], tmp_path: Path
+) -> None:
+    for way, (start, goal) in {"open": (0.1, 0.7), "close": (0.8, 0.2)}.items():
+        trials = []
+        for obj in objects:
+            link = openable_links(obj)[0]
+            trial = default_trial(obj, link, fraction=start, goal=goal)
+            trials.append(Scheduled(trial, obj.category, "", obj.links[link].name, "", ""))
+        rows = run_trials("expert", expert_policy(LIMITS), objects, trials, OPTIONS)
+        assert [row.success for row in rows] == [True] * len(rows), way
+        assert all(row.steps > 5 for row in rows)

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
-from fb3d_rl.evaluation.trials import schedule
-from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
+from fb3d_rl.flow.opening import openable_links, opening_range
 
 OPTIONS = SampleOptions(points=300, camera=CameraOptions(resolution=48))
 
@@ -49,3 +50,28 @@ def test_a_limit_takes_the_categories_in_turn(objects: list[tuple[ArticulatedObj
     trials, _ = schedule(objects, OPTIONS, seed=0, limit=3)
     assert {item.category for item in trials} == {"StorageFurniture", "KitchenPot", "Microwave"}
     assert len(trials) == 3
+
+
+def test_protocols_start_where_they_say(objects: list[tuple[ArticulatedObject, str]]) -> None:
+    def fractions(how: ScheduleOptions) -> tuple[NDArray[np.float64], NDArray[np.float64], list[Scheduled]]:
+        items, _ = schedule(objects, OPTIONS, seed=0, how=how)
+        starts, goals = [], []
+        for item in items:
+            obj = next(obj for obj, _ in objects if obj.id == item.trial.object)
+            closed, opened = opening_range(obj)
+            j = obj.movable.index(item.trial.link)
+            goal = opened[j] if item.trial.goal is None else item.trial.goal
+            starts.append((item.trial.start[j] - closed[j]) / (opened[j] - closed[j]))
+            goals.append((goal - closed[j]) / (opened[j] - closed[j]))
+        return np.array(starts), np.array(goals), items
+
+    start, goal, items = fractions(ScheduleOptions(start="closed", repeats=5))
+    assert (start == 0).all() and (goal == 1).all()
+    assert {item.repeat for item in items} == set(range(5))
+    assert len({(item.trial.view, item.trial.seed) for item in items}) == len(items), "each has a view and seed"
+    once, _ = schedule(objects, OPTIONS, seed=0, how=ScheduleOptions(start="closed"))
+    assert [item for item in items if item.repeat == 0] == once
+    start, goal, _ = fractions(ScheduleOptions(start="random", repeats=10))
+    assert start.min() < 0.2 and 0.7 < start.max() <= 0.9 and (goal == 1).all()
+    start, goal, _ = fractions(ScheduleOptions(goal="state", repeats=10))
+    assert (abs(goal - start) > 0.299).all() and (goal > start).any() and (goal < start).any()

@@ -75,6 +75,7 @@ class ToyDoor:
                     "attached": torch.tensor([[self.held is not None]]),
                     "contact_force": torch.zeros(1, 1),
                     "camera_position": torch.tensor([[-3.0, 0.0, 1.0]]),
+                    "goal_sense": torch.ones(1, 1),
                 },
                 "privileged": {"flow": self.flow()[None]},
                 "policy": state,

@@ -87,6 +87,7 @@ def scene(count: int, attached: bool = False) -> TensorDict:
         "attached": torch.full((count, 1), attached),
         "contact_force": torch.zeros(count, 1),
         "camera_position": torch.tensor([[-3.0, 0.4, 1.0]]).expand(count, 3).clone(),
+        "goal_sense": torch.ones(count, 1),
     }
     content = {
         "observation": observation,
