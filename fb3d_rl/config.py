@@ -354,6 +354,13 @@ class EvaluateConfig(CommandConfig):
     checkpoint: str | None
 
 
+UNTRAINED = ("expert", "random", "normal")
+"""Policies that need no checkpoint."""
+
+TRAINED = ("artflownet", "bc", "dagger")
+"""What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""
+
+
 def validate(cfg: CommandConfig) -> None:
     """Check values that types cannot; the one place for it.
 
@@ -361,7 +368,7 @@ def validate(cfg: CommandConfig) -> None:
         UserError: names the first key that is wrong and what it may be.
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
-    _one_of("policy.name", cfg.policy.name, ("expert", "artflownet", "bc", "dagger"))
+    _one_of("policy.name", cfg.policy.name, UNTRAINED + TRAINED)
     _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
     _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
     _at_least("collector.restarts", cfg.collector.restarts, 0)
@@ -370,7 +377,7 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
-        _one_of("algo.name", cfg.algo.name, ("artflownet", "bc", "dagger"))
+        _one_of("algo.name", cfg.algo.name, TRAINED)
         _one_of("logger.name", cfg.logger.name, ("none", "csv", "tensorboard", "wandb"))
         _one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         if isinstance(cfg.algo, ArtFlowNetConfig):
@@ -380,7 +387,7 @@ def validate(cfg: CommandConfig) -> None:
         _at_least("data.train_samples", cfg.data.train_samples, 1)
         _at_least("data.met_samples", cfg.data.met_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
-    if isinstance(cfg, EvaluateConfig) and cfg.policy.name != "expert" and not cfg.checkpoint:
+    if isinstance(cfg, EvaluateConfig) and cfg.policy.name in TRAINED and not cfg.checkpoint:
         raise UserError(f"policy={cfg.policy.name} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
     _at_least("seed", cfg.seed, 0)
     _at_least("data.points", cfg.data.points, 64)

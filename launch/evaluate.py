@@ -1,4 +1,4 @@
-"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet|bc|dagger [checkpoint=PATH] [assets=...] ...``."""
+"""Evaluate: ``python launch/evaluate.py policy=expert|random|normal|artflownet|bc|dagger [checkpoint=PATH] [assets=...] ...``."""
 
 from __future__ import annotations
 

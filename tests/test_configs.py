@@ -61,7 +61,7 @@ def options(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    other = {("train", f"policy/{name}") for name in ("expert", "bc", "dagger")}
+    other = {("train", f"policy/{name}") for name in ("expert", "random", "normal", "bc", "dagger")}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
     return [
         (name, option) for name in ("train", "evaluate") for option in options(name) if (name, option) not in skipped

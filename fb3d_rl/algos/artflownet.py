@@ -22,6 +22,7 @@ from fb3d_rl.evaluation.flow import held_out_samples, predict
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, fit
@@ -208,14 +209,19 @@ def load_network(path: str | Path) -> ArtFlowNet:
 
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
-    """Evaluate the expert, or a trained ArtFlowNet beside the expert."""
+    """Evaluate the expert, a baseline that learns nothing, or a trained ArtFlowNet, beside the expert."""
     protocol = setup.protocol(cfg)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
-    net = load_network(cfg.checkpoint) if cfg.policy.name == "artflownet" and cfg.checkpoint else None
+    name = cfg.policy.name
+    net = load_network(cfg.checkpoint) if name == "artflownet" and cfg.checkpoint else None
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     policies: dict[str, Any] = {}
-    if cfg.policy.name == "expert" or cfg.evaluation.expert:
+    if name == "expert" or cfg.evaluation.expert:
         policies["expert"] = expert_policy(limits, speeds)
-    if net is not None:
-        policies["artflownet"] = artflownet_policy(net, limits, speeds)
+    if name == "random":
+        policies[name] = RandomPolicy()
+    elif name == "normal":
+        policies[name] = normal_policy(limits, speeds)
+    elif net is not None:
+        policies[name] = artflownet_policy(net, limits, speeds)
     return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
