@@ -91,7 +91,7 @@ class AlgoConfig:
 
 @dataclass
 class ArtFlowNetConfig(AlgoConfig):
-    """fb3d_rl.training.fit.FitOptions and the network's arguments.
+    """fb3d_rl.training.fit.FitOptions and the network's arguments, for every network that flow samples train.
 
     Attributes:
         epochs: how often each training sample is drawn; with the batch size it gives the number of steps.
@@ -357,7 +357,7 @@ class EvaluateConfig(CommandConfig):
 UNTRAINED = ("expert", "random", "normal")
 """Policies that need no checkpoint."""
 
-TRAINED = ("artflownet", "bc", "dagger")
+TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
 """What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""
 
 
@@ -425,6 +425,8 @@ def validate(cfg: CommandConfig) -> None:
 def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
     _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
     _one_of("algo.backbone", algo.backbone, ("pointnet2", "delayed"))
+    if algo.name != "artflownet" and not algo.part_mask_input:
+        raise UserError(f"algo={algo.name} is of one part, which the mask shows: leave algo.part_mask_input=true")
     for key in ("batch_size", "log_every", "neighbors"):
         _at_least(f"algo.{key}", getattr(algo, key), 1)
     if algo.ema is not None and not 0 < algo.ema < 1:

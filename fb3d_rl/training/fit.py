@@ -164,11 +164,16 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
     def objective(batch: TensorDictBase, step: int) -> Tensor:
         batch = augment(batch, options, step, share)
         points, valid = batch["observation", "points"], batch["observation", "valid"]
-        with torch.autocast(points.device.type, torch.bfloat16, enabled=options.precision == "bf16"):
+        with products_of(options, points.device):
             predicted = model(points, valid, batch["observation", "part_mask"])
         return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
 
     return objective
+
+
+def products_of(options: FitOptions, device: torch.device) -> torch.autocast:
+    """The context in which a network's products are of the precision that the options say."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bf16")
 
 
 def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice = slice(None)) -> TensorDictBase:
