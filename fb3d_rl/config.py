@@ -91,7 +91,7 @@ class AlgoConfig:
 
 @dataclass
 class ArtFlowNetConfig(AlgoConfig):
-    """fb3d_rl.training.fit.FitOptions and the network's arguments.
+    """fb3d_rl.training.fit.FitOptions and the network's arguments, for every network that flow samples train.
 
     Attributes:
         epochs: how often each training sample is drawn; with the batch size it gives the number of steps.
@@ -367,6 +367,13 @@ class EvaluateConfig(CommandConfig):
     resume: bool
 
 
+UNTRAINED = ("expert", "random", "normal")
+"""Policies that need no checkpoint."""
+
+TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
+"""What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""
+
+
 def validate(cfg: CommandConfig) -> None:
     """Check values that types cannot; the one place for it.
 
@@ -374,7 +381,7 @@ def validate(cfg: CommandConfig) -> None:
         UserError: names the first key that is wrong and what it may be.
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
-    _one_of("policy.name", cfg.policy.name, ("expert", "artflownet", "bc", "dagger"))
+    _one_of("policy.name", cfg.policy.name, UNTRAINED + TRAINED)
     _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
     _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
     _at_least("collector.restarts", cfg.collector.restarts, 0)
@@ -383,7 +390,7 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
     if isinstance(cfg, TrainConfig):
-        _one_of("algo.name", cfg.algo.name, ("artflownet", "bc", "dagger"))
+        _one_of("algo.name", cfg.algo.name, TRAINED)
         _one_of("logger.name", cfg.logger.name, ("none", "csv", "tensorboard", "wandb"))
         _one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         if isinstance(cfg.algo, ArtFlowNetConfig):
@@ -393,7 +400,7 @@ def validate(cfg: CommandConfig) -> None:
         _at_least("data.train_samples", cfg.data.train_samples, 1)
         _at_least("data.met_samples", cfg.data.met_samples, 1)
         _at_least("assets.train_count", cfg.assets.train_count, 1)
-    if isinstance(cfg, EvaluateConfig) and cfg.policy.name != "expert" and not cfg.checkpoint:
+    if isinstance(cfg, EvaluateConfig) and cfg.policy.name in TRAINED and not cfg.checkpoint:
         raise UserError(f"policy={cfg.policy.name} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
     _at_least("seed", cfg.seed, 0)
     _at_least("data.points", cfg.data.points, 64)
@@ -440,6 +447,8 @@ def validate(cfg: CommandConfig) -> None:
 def _validate_artflownet(algo: ArtFlowNetConfig) -> None:
     _one_of("algo.schedule", algo.schedule, ("constant", "one_cycle"))
     _one_of("algo.backbone", algo.backbone, ("pointnet2", "delayed"))
+    if algo.name != "artflownet" and not algo.part_mask_input:
+        raise UserError(f"algo={algo.name} is of one part, which the mask shows: leave algo.part_mask_input=true")
     for key in ("batch_size", "log_every", "neighbors"):
         _at_least(f"algo.{key}", getattr(algo, key), 1)
     if algo.ema is not None and not 0 < algo.ema < 1:

@@ -85,7 +85,7 @@ GROUPS: dict[str, dict[Key, Entry]] = {
         ),
     },
     "prediction": {
-        ("prediction", "flow"): Entry(("N", 3), F32, "ArtFlowNet's flow"),
+        ("prediction", "flow"): Entry(("N", 3), F32, "ArtFlowNet's flow, or what a baseline follows in its place"),
     },
     "metrics": {
         "normalized_distance": Entry((1,), F32, "|q_goal - q| / |q_goal - q_start|"),

@@ -1,4 +1,4 @@
-"""Evaluate: ``python launch/evaluate.py policy=expert|artflownet|bc|dagger [checkpoint=PATH] [assets=...] ...``."""
+"""Evaluate: ``python launch/evaluate.py policy=NAME [checkpoint=PATH] [assets=...] ...``, NAME as in conf/policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train: ``python launch/train.py [algo=artflownet|bc|dagger] [assets=partnet_mobility assets.root=DIR] ...``.
+"""Train: ``python launch/train.py [algo=NAME] [assets=partnet_mobility assets.root=DIR] ...``, NAME as in conf/algo.
 
 ArtFlowNet by several processes or GPUs: ``torchrun --nproc-per-node=N launch/train.py algo=artflownet ...``.
 """
@@ -20,7 +20,7 @@ def task(cfg: Any, out: Path) -> None:
     if cfg.algo.name != "artflownet" and started() > 1:
         raise UserError(f"algo={cfg.algo.name} is trained by one process: start it without torchrun")
     with joined(out, fresh=not cfg.resume) as shared:
-        {"artflownet": artflownet.run, "bc": dagger.run, "dagger": dagger.run}[cfg.algo.name](cfg, shared)
+        (dagger if cfg.algo.name in dagger.ALGOS else artflownet).run(cfg, shared)
 
 
 if __name__ == "__main__":

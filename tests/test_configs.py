@@ -35,6 +35,8 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "assets/mixed"): ["assets.root=."],
     ("evaluate", "assets/mixed"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/ump_di"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/dagger"): ["checkpoint=checkpoint.pt"],
 }
@@ -61,7 +63,9 @@ def options(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    other = {("train", f"policy/{name}") for name in ("expert", "bc", "dagger")}
+    other = {
+        ("train", f"policy/{name}") for name in ("expert", "random", "normal", "screwnet", "ump_di", "bc", "dagger")
+    }
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
     return [
         (name, option) for name in ("train", "evaluate") for option in options(name) if (name, option) not in skipped

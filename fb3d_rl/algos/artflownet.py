@@ -1,4 +1,7 @@
-"""algo=artflownet: draw flow samples, fit ArtFlowNet, then measure it and let it open things."""
+"""algo=artflownet: draw flow samples, fit ArtFlowNet, then measure it and let it open things.
+
+So do the other algorithms of :mod:`fb3d_rl.algos.kinds` with their networks.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +17,17 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import meet_samples
+from fb3d_rl.algos.kinds import KINDS
 from fb3d_rl.contract import UserError, check
 from fb3d_rl.data.generate import Joined, generate_samples, load_samples
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
-from fb3d_rl.evaluation.flow import held_out_samples, predict
+from fb3d_rl.evaluation.flow import held_out_samples
 from fb3d_rl.evaluation.rows import TrialRow
-from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
+from fb3d_rl.flow.metrics import mean_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, fit, require_compiler
@@ -56,7 +62,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     device = setup.choose_device(cfg.device)
     protocol = setup.protocol(cfg)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
-    resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
+    name, kind = cfg.algo.name, KINDS[cfg.algo.name]
+    resume = load_checkpoint(out / CHECKPOINT, algo=name) if cfg.resume else None
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
     options, net = fit_options(cfg), new_network(cfg)
     met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
@@ -84,8 +91,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
     def validate(measured: nn.Module) -> dict[str, float]:
         """On all held-out objects, and on those of each split where there are several."""
-        flow, valid = validation["privileged", "flow"], validation["observation", "valid"]
-        metrics = flow_metrics(predict(cast(ArtFlowNet, measured), validation, device), flow, valid)
+        metrics = kind.measure(cast(CloudNetwork, measured), validation, device)
         numbers = {f"val/{key}": value for key, value in mean_metrics(metrics).items()}
         for split in sorted(set(split_of_row)) if len(set(split_of_row)) > 1 else []:
             rows = torch.tensor([other == split for other in split_of_row])
@@ -93,28 +99,29 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
             numbers |= {f"val/{split}/{key}": value for key, value in own.items()}
         if numbers["val/cosine"] > best_cosine(out / BEST):
             about = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(cfg.seed), "git_revision": git_revision()}
-            cast(ArtFlowNet, measured).save_pretrained(out / BEST, about)
+            cast(CloudNetwork, measured).save_pretrained(out / BEST, about)
         return numbers
 
     def checkpoint(state: dict[str, Any]) -> None:
         path, config = out / CHECKPOINT, asdict(cfg)
-        save_checkpoint(path, algo="artflownet", config=config, model_kwargs=net.arguments, state=state, seed=cfg.seed)
+        save_checkpoint(path, algo=name, config=config, model_kwargs=net.arguments, state=state, seed=cfg.seed)
 
     if resume is None:
         (out / BEST).unlink(missing_ok=True)
     with RunLog(out, resume_step=resume["step"] if resume else None, logger=logger) as run_log:
-        fit(net, buffer, options, device=device, evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
+        fit(net, buffer, options, objective=kind.objective and kind.objective(net, options), device=device,
+            evaluate=validate, log=run_log.write, on_checkpoint=checkpoint,
             resume=resume["state"] if resume else None)  # fmt: skip
 
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
-    policies["artflownet"] = artflownet_policy(net.to("cpu"), limits, speeds)
-    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
+    policies[name] = kind.policy(net.to("cpu"), limits, speeds)
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net if kind.flow else None)
 
 
 def assist(cfg: TrainConfig, out: Path) -> None:
     """Fit beside the first of several processes, which does all the rest, once the samples are there."""
     device, options = setup.choose_device(cfg.device), fit_options(cfg)
-    resume = load_checkpoint(out / CHECKPOINT, algo="artflownet") if cfg.resume else None
+    resume = load_checkpoint(out / CHECKPOINT, algo=cfg.algo.name) if cfg.resume else None
     net = new_network(cfg)
     wait_for_all()
     rows, state = training_rows(cfg, out), resume["state"] if resume else None
@@ -147,7 +154,7 @@ def best_cosine(path: Path) -> float:
 
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
-    """How ArtFlowNet is fitted.
+    """How the network is fitted.
 
     Raises:
         UserError: the batch cannot be shared out to the processes that fit together.
@@ -178,7 +185,7 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     )
 
 
-def new_network(cfg: TrainConfig) -> ArtFlowNet:
+def new_network(cfg: TrainConfig) -> CloudNetwork:
     """The network to train: its weights depend on the seed alone, or are those of ``algo.start_from``.
 
     Raises:
@@ -186,9 +193,9 @@ def new_network(cfg: TrainConfig) -> ArtFlowNet:
     """
     algo = cast("ArtFlowNetConfig", cfg.algo)
     generator = torch.Generator().manual_seed(cfg.seed)
-    net = ArtFlowNet(algo.part_mask_input, algo.neighbors, algo.backbone, generator)
+    net = KINDS[algo.name].network(algo.part_mask_input, algo.neighbors, algo.backbone, generator)
     if algo.start_from:
-        begun = load_network(algo.start_from)
+        begun = load_trained(algo.start_from, algo.name)
         if begun.arguments != net.arguments:
             different = [f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments[key] != value]
             raise UserError(f"algo.start_from={algo.start_from} is another network; give {' '.join(different)}")
@@ -197,28 +204,39 @@ def new_network(cfg: TrainConfig) -> ArtFlowNet:
 
 
 def load_network(path: str | Path) -> ArtFlowNet:
-    """The network of a checkpoint that :func:`run` wrote, of a .safetensors file, or "pretrained".
+    """The ArtFlowNet of a checkpoint that :func:`run` wrote, of a .safetensors file, or "pretrained".
 
     Raises:
         UserError: the file is missing or no such checkpoint.
     """
-    if str(path) == "pretrained" or Path(path).suffix == ".safetensors":
-        return ArtFlowNet.from_pretrained(path)
-    content = load_checkpoint(path, algo="artflownet")
-    net = ArtFlowNet(**content["model_kwargs"])
+    return cast(ArtFlowNet, load_trained(path, ArtFlowNet.NAME))
+
+
+def load_trained(path: str | Path, name: str) -> CloudNetwork:
+    """As :func:`load_network`, for any of the kinds."""
+    network = KINDS[name].network
+    if Path(path).suffix == ".safetensors" or (str(path) == "pretrained" and network is ArtFlowNet):
+        return network.from_pretrained(path)
+    content = load_checkpoint(path, algo=name)
+    net = network(**content["model_kwargs"])
     net.load_state_dict(content["state"].get("average") or content["state"]["model"])
     return net.eval()
 
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
-    """Evaluate the expert, or a trained ArtFlowNet beside the expert."""
+    """Evaluate the expert, a baseline that learns nothing, or what a trained network does, beside the expert."""
     protocol = setup.evaluation_protocol(cfg, out)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
-    net = load_network(cfg.checkpoint) if cfg.policy.name == "artflownet" and cfg.checkpoint else None
+    name, kind = cfg.policy.name, KINDS.get(cfg.policy.name)
+    net = load_trained(cfg.checkpoint, name) if kind and cfg.checkpoint else None
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     policies: dict[str, Any] = {}
-    if cfg.policy.name == "expert" or cfg.evaluation.expert:
+    if name == "expert" or cfg.evaluation.expert:
         policies["expert"] = expert_policy(limits, speeds)
-    if net is not None:
-        policies["artflownet"] = artflownet_policy(net, limits, speeds)
-    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net)
+    if name == "random":
+        policies[name] = RandomPolicy()
+    elif name == "normal":
+        policies[name] = normal_policy(limits, speeds)
+    elif kind and net:
+        policies[name] = kind.policy(net, limits, speeds)
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net if kind and kind.flow else None)

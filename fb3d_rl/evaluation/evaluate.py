@@ -14,6 +14,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import UserError
@@ -30,7 +31,6 @@ from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
 from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.files import write_text
 from fb3d_rl.flow.metrics import flow_metrics
-from fb3d_rl.models.artflownet import ArtFlowNet
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def evaluate(
     policies: Mapping[str, TensorDictModuleBase],
     protocol: Protocol,
     facts: Mapping[str, Any],
-    net: ArtFlowNet | None = None,
+    net: nn.Module | None = None,
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
@@ -186,7 +186,7 @@ def _keep(
 
 def _measure_flow(
     out: Path,
-    net: ArtFlowNet,
+    net: nn.Module,
     objects: Sequence[tuple[ArticulatedObject, str]],
     protocol: Protocol,
 ) -> tuple[list[FlowRow], dict[str, Any]]:

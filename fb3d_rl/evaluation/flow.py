@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase, lazy_stack
+from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.evaluation.rows import FlowRow
 from fb3d_rl.flow.metrics import flow_metrics
-from fb3d_rl.models.artflownet import ArtFlowNet
 
 TARGETS = ("part", "all")
 
@@ -52,7 +52,7 @@ def held_out_samples(
 
 
 @torch.no_grad()
-def predict(net: ArtFlowNet, samples: TensorDictBase, device: torch.device, batch_size: int = 32) -> torch.Tensor:
+def predict(net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int = 32) -> torch.Tensor:
     """Predicted flow [S, N, 3] of samples [S], in the network's evaluation mode."""
     training = net.training
     net.eval()

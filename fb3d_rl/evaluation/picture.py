@@ -38,7 +38,7 @@ def write_picture(run_dir: Path, columns: int = 4) -> Path:
             if row == 0:
                 axes.set_title("\n".join(str(data["title"][column]).split(", ")[:2]), fontsize=9)
             if column == 0:
-                label = "true flow" if row == 0 else "ArtFlowNet"
+                label = "true flow" if row == 0 else "predicted flow"
                 axes.text2D(-0.02, 0.5, label, transform=axes.transAxes, rotation=90, va="center", fontsize=11)
     figure.subplots_adjust(left=0.03, right=0.99, top=0.92, bottom=0.01, wspace=0.02, hspace=0.02)
     path, part = run_dir / "flow.png", run_dir / "flow.png.part"

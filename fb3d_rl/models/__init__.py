@@ -1,1 +1,1 @@
-"""Networks: PointNet++ and ArtFlowNet."""
+"""Networks: PointNet++, ArtFlowNet and those of the baselines."""

@@ -14,12 +14,12 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 
 from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
-from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
+from fb3d_rl.models.artflownet import artflownet_module
 from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
@@ -452,7 +452,7 @@ def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = No
 
 
 def artflownet_policy(
-    net: ArtFlowNet, limits: VelocityLimits, options: FlowPolicyOptions | None = None
+    net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
 ) -> TensorDictModule:
-    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy."""
+    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form."""
     return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))

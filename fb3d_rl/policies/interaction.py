@@ -44,18 +44,18 @@ class Gate(nn.Module):
         raise NotImplementedError
 
 
-def uniform(tensordict: TensorDictBase, purpose: int, per_step: bool = True) -> Tensor:
-    """A random number [E, 1] from 0 to below 1 for each environment.
+def uniform(tensordict: TensorDictBase, purpose: int, per_step: bool = True, count: int = 1) -> Tensor:
+    """Random numbers [E, count] from 0 to below 1 for each environment, float64.
 
-    It depends on the trial's seed, the purpose and, if ``per_step``, the step alone, so that an episode is the same
+    They depend on the trial's seed, the purpose and, if ``per_step``, the step alone, so that an episode is the same
     whichever worker runs it.
     """
     seeds, steps = tensordict["seed"].flatten().tolist(), tensordict["elapsed_steps"].flatten().tolist()
     draws = [
-        np.random.default_rng([seed, purpose, step if per_step else 0]).random()
+        np.random.default_rng([seed, purpose, step if per_step else 0]).random(count)
         for seed, step in zip(seeds, steps, strict=True)
     ]
-    return torch.tensor(draws, dtype=torch.float64)[:, None]
+    return torch.from_numpy(np.stack(draws))
 
 
 class BetaGate(Gate):

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, cast
 
 import torch
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -67,8 +67,8 @@ class FitOptions:
         dropout: take up to this share of its points, drawn for every cloud, out of it.
         precision: "fp32", or "bf16": a flow network's products in bfloat16 (autocast), its weights, places and the rest
             in float32.
-        compile: run a flow network's layers through torch.compile, which takes a while before the first step and pays
-            on GPUs at most: what costs time on a CPU, the balls, stays as it is.
+        compile: run the layers of a network's PointNet++ through torch.compile, which takes a while before the first
+            step and pays on GPUs at most: what costs time on a CPU, the balls, stays as it is.
         seed: of the rows drawn and of the rotations.
         log_every: steps from one log row to the next.
         evaluate_every: steps from one evaluation to the next; None only at the end.
@@ -163,13 +163,12 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
 
     ``share`` is the part of the whole batch that the objective is given.
     """
-    network = torch.compile(model, dynamic=True) if options.compile else model
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
         batch = augment(batch, options, step, share)
         points, valid = batch["observation", "points"], batch["observation", "valid"]
-        with torch.autocast(points.device.type, torch.bfloat16, enabled=options.precision == "bf16"):
-            predicted = network(points, valid, batch["observation", "part_mask"])
+        with products_of(options, points.device):
+            predicted = model(points, valid, batch["observation", "part_mask"])
         return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
 
     return objective
@@ -188,6 +187,11 @@ def require_compiler(device: torch.device) -> None:
         raise UserError(
             f"torch.compile does not work here ({reason}): install a C++ compiler (on a GPU: Triton), or leave it off"
         ) from error
+
+
+def products_of(options: FitOptions, device: torch.device) -> torch.autocast:
+    """The context in which a network's products are of the precision that the options say."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bf16")
 
 
 def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice = slice(None)) -> TensorDictBase:
@@ -317,6 +321,8 @@ def fit(
     if rows == 0:
         raise UserError("There are no clouds to train on: generate flow samples first.")
     model.to(device).train()
+    if options.compile:
+        cast(nn.Module, model.network).compile(dynamic=True)
     objective = objective or flow_objective(model if processes == 1 else DistributedDataParallel(model), options, share)
     optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
     average = None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)

@@ -10,7 +10,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import UserError, check
 from fb3d_rl.evaluation import network_speed
 from fb3d_rl.evaluation.network_speed import draw_clouds, install_peer
-from fb3d_rl.models.artflownet import BACKBONES
+from fb3d_rl.models.cloud_network import BACKBONES
 
 
 def silent(text: str) -> None:

@@ -10,7 +10,8 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.models.artflownet import BACKBONES, POINTS, ArtFlowNet, artflownet_module
+from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, artflownet_module
+from fb3d_rl.models.cloud_network import BACKBONES
 
 Maker: TypeAlias = "Callable[..., ArtFlowNet]"
 

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.models.artflownet import BACKBONES, ArtFlowNet
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.cloud_network import BACKBONES
 from fb3d_rl.models.export import DenseArtFlowNet, export
 
 
