@@ -5,6 +5,7 @@ Nothing here knows of a page; the simulator is loaded when a trial begins.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
@@ -45,7 +46,7 @@ PICK = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where the hand touches, which way it pulls there, and on which side it stands: [3] each, m and two unit vectors."""
+    """Where the hand touches (m), which way it pulls there and on which side it stands (unit vectors), [3] each."""
 
     point: NDArray[np.float32]
     pull: NDArray[np.float32]
@@ -171,7 +172,7 @@ class Session:
     def set_joint(self, index: int, position: float) -> None:
         """Move joint ``index`` of the joint state [J] to a position, rad or m."""
         state = self.moment.qpos.copy()
-        state[index] = position
+        state[index] = np.clip(position, *self.limits[index])
         self._trial = replace(self._trial, start=tuple(state.tolist()))
         self._look()
 
@@ -209,7 +210,17 @@ class Session:
         """Diameter of the closed object's bounding sphere, m."""
         return 2 * self._object.camera.radius
 
-    def pick(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+    @property
+    def field_of_view(self) -> float:
+        """The camera's, rad."""
+        return math.radians(self._object.camera.options.fov)
+
+    @property
+    def period(self) -> float:
+        """Time (s) of a control step."""
+        return 1.0 / self._env_options.control_freq
+
+    def pick(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> None:
         """Let the policy touch the point of the part that a ray meets, in place of the one that it would choose.
 
         Args:
@@ -225,8 +236,8 @@ class Session:
         on_part = (obs["valid"] & obs["part_mask"])[0].nonzero().flatten()
         if not len(on_part):
             raise UserError("the camera sees nothing of the part; turn it until it does")
-        way = obs["points"][0, on_part].double() - torch.tensor(origin, dtype=torch.float64)
-        ray = torch.tensor(direction, dtype=torch.float64)
+        way = obs["points"][0, on_part].double() - torch.as_tensor(origin)
+        ray = torch.as_tensor(direction)
         along = way @ (ray / ray.norm())
         aside = (way.square().sum(-1) - along.square()).clamp_min(0).sqrt()
         row = int(on_part[torch.where(aside <= aside.min() + PICK, along, torch.inf).argmin()])
@@ -236,7 +247,8 @@ class Session:
         picked = self._choose(others)
         if not torch.equal(picked[0][0], obs["points"][0, row]):
             raise UserError(
-                f"the {self.flow} flow there is {float(norm[row]):.2f}, too little to pull along; pick a point that moves"
+                f"the {self.flow} flow there is {float(norm[row]):.2f}, too little to pull along; "
+                "pick a point that moves"
             )
         self._picked = picked
         if self.trial is not None:
@@ -253,7 +265,9 @@ class Session:
         points, links = object_view.cloud(qpos, trial.view, self._points, np.random.default_rng([trial.seed, 0]))
         frame = object_view.sample(links, points, qpos, trial.link)[None]
         poses = object_view.poses(qpos).numpy()
-        corners = [link_corners(link) @ pose[:3, :3].T + pose[:3, 3] for link, pose in zip(self.obj.links, poses, strict=True)]
+        corners = [
+            link_corners(link) @ pose[:3, :3].T + pose[:3, 3] for link, pose in zip(self.obj.links, poses, strict=True)
+        ]
         stacked = np.concatenate(corners)
         tip = self._env_options.gripper.start(np.stack([stacked.min(0), stacked.max(0)])) + [TIP, 0, 0]
         frame["observation", "tool_pose"] = torch.tensor([[*tip, 1, 0, 0, 0]], dtype=torch.float32)
@@ -304,7 +318,7 @@ class Session:
         return Contact(point[0].numpy(), pull[0].numpy(), standoff[0].numpy()) if bool(pull.any()) else None
 
     def _choose(self, avoid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The policy's choice of a contact point, or where it would stand off the only point that is not to be avoided."""
+        """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
         obs, options = self._frame["observation"], self._policy_options.contact
         part = obs["part_mask"] & obs["valid"]
         flow = torch.where(part[..., None], self._frame[FLOWS[self.flow]], 0.0)
@@ -314,7 +328,15 @@ class Session:
             options = replace(options, min_flow=0.0, weak_flow=0.0)
         pose = obs["tool_pose"]
         return choose_contact(
-            obs["points"], obs["valid"], part, flow, obs["camera_position"], pose[:, :3], hand_axis(pose), avoid, options
+            obs["points"],
+            obs["valid"],
+            part,
+            flow,
+            obs["camera_position"],
+            pose[:, :3],
+            hand_axis(pose),
+            avoid,
+            options,
         )
 
     # ------------------------------------------------------------------------------------------------------ a trial
@@ -363,6 +385,11 @@ class Session:
             done=over,
         )
         self.moment = self._moment()
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the simulator is there already."""
+        return self._base is not None
 
     @property
     def gripper(self) -> Sequence[Sequence[Mesh]]:
