@@ -193,7 +193,7 @@ class Page:
             @buttons.on_click
             def _(event: Any) -> None:
                 button = str(event.target.value)
-                self._wish(event, lambda: self._act(button))  # each press counts
+                self._wish(object(), lambda: self._act(button))  # each press counts
 
             self._status = gui.add_markdown("")
             self._message = gui.add_markdown("")
