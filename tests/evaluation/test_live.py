@@ -373,7 +373,7 @@ def test_in_a_browser_a_click_picks_a_point_and_play_opens_the_part(server: Any,
         box = browser_page.locator("canvas").first.bounding_box()
         half = math.tan(0.5 * guest.fov) * z
         place = 0.5 + 0.5 * np.array([x / half / guest.aspect, y / half])
-        at = np.array([box["x"], box["y"]]) + place * [box["width"], box["height"]]
+        at = np.array([box["x"], box["y"]]) + place * box["height"] * [guest.aspect, 1.0]  # beside the panel
         browser_page.mouse.move(*at)
         browser_page.wait_for_timeout(500)
         browser_page.mouse.click(*at, delay=60)
