@@ -44,7 +44,7 @@ LABELS = {"predicted": "Predicted flow (orange)", "true": "True flow (green)"}
 SEEN, PART, CONTACT, CAMERA = srgb("#868e99"), srgb("#1f4f8f"), srgb("#e0218a"), srgb("#5b6470")
 """Of points of the cloud, of those on the part, of the contact point and of the camera."""
 
-ARROWS = 90
+ARROWS = 50
 """Arrows of each flow."""
 
 LENGTH = 0.13
