@@ -374,6 +374,21 @@ TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
 """What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""
 
 
+@dataclass
+class ViewConfig(CommandConfig):
+    """Everything that launch/view.py needs.
+
+    Attributes:
+        checkpoint: an ArtFlowNet, as checkpoint.pt, .safetensors or "pretrained"; null shows the true flow alone.
+        object: the folder of an object, its id, or a category, of which it is the first; null for the first of all.
+        port: where the page is served, on this machine alone; the next free one if it is taken.
+    """
+
+    checkpoint: str | None
+    object: Any
+    port: int
+
+
 def validate(cfg: CommandConfig) -> None:
     """Check values that types cannot; the one place for it.
 
@@ -402,6 +417,10 @@ def validate(cfg: CommandConfig) -> None:
         _at_least("assets.train_count", cfg.assets.train_count, 1)
     if isinstance(cfg, EvaluateConfig) and cfg.policy.name in TRAINED and not cfg.checkpoint:
         raise UserError(f"policy={cfg.policy.name} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
+    if isinstance(cfg, ViewConfig):
+        _one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+        if not 1 <= cfg.port <= 65535:
+            raise UserError(f"port={cfg.port} is no port; give a number from 1 to 65535")
     _at_least("seed", cfg.seed, 0)
     _at_least("data.points", cfg.data.points, 64)
     _at_least("data.eval_samples", cfg.data.eval_samples, 1)

@@ -20,17 +20,23 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
 from fb3d_rl.contract import UserError
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
-SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig]] = {"train": TrainConfig, "evaluate": EvaluateConfig}
+SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig | ViewConfig]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "view": ViewConfig,
+}
 
 ALGOS = {"artflownet": ArtFlowNetConfig, "imitation": ImitationConfig}
 
 
-def main(name: str, task: Callable[[Any, Path], Any]) -> None:
+def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> None:
     """Run ``task(config, run folder)`` with conf/<name>.yaml and the overrides of the command line.
+
+    With ``keeps=False`` nothing is kept of a run: hydra.run.dir is no folder of its own, and nothing is written there.
 
     Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend.
     """
@@ -41,12 +47,12 @@ def main(name: str, task: Callable[[Any, Path], Any]) -> None:
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:
         out = Path(HydraConfig.get().runtime.output_dir)
-        fresh = not any(out.iterdir())
+        fresh = keeps and not any(out.iterdir())
         with _one_sentence():
             try:
                 cfg: Any = OmegaConf.to_object(raw)
                 validate(cfg)
-                if not getattr(cfg, "resume", False):  # a resumed run keeps its own
+                if keeps and not getattr(cfg, "resume", False):  # a resumed run keeps its own
                     OmegaConf.save(raw, out / "config.yaml")
                 task(cfg, out)
             except UserError:

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, validate
+from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -54,7 +54,7 @@ def real_root() -> Path:
 def schemas() -> None:
     """The typed schemas that conf/ names, as the commands register them."""
     store = ConfigStore.instance()
-    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig)):
+    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig), ("view", ViewConfig)):
         store.store(name=f"{name}_schema", node=schema)
     for kind, algo in (("artflownet", ArtFlowNetConfig), ("imitation", ImitationConfig)):
         store.store(group="algo", name=f"{kind}_schema", node=algo)
@@ -64,7 +64,7 @@ def schemas() -> None:
 def config(schemas: None) -> Callable[[str, list[str]], Any]:
     """Composes and checks conf/<name>.yaml with overrides, as the command of that name does."""
 
-    def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig:
+    def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig | ViewConfig:
         with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
             cfg = OmegaConf.to_object(compose(name, overrides))
         validate(cfg)

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from fb3d_rl import config
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
-from fb3d_rl.config import EvaluateConfig, TrainConfig, validate
+from fb3d_rl.config import EvaluateConfig, TrainConfig, ViewConfig, validate
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
@@ -28,10 +28,13 @@ from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"
+SCHEMAS = {"train": TrainConfig, "evaluate": EvaluateConfig, "view": ViewConfig}
 ABSTRACT = {"policy/flow"}  # what the options of a group share
 NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "assets/partnet_mobility"): ["assets.root=."],
     ("evaluate", "assets/partnet_mobility"): ["assets.root=."],
+    ("view", "assets/partnet_mobility"): ["assets.root=."],
+    ("view", "assets/mixed"): ["assets.root=."],
     ("train", "assets/mixed"): ["assets.root=."],
     ("evaluate", "assets/mixed"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
@@ -63,19 +66,17 @@ def options(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    other = {
-        ("train", f"policy/{name}") for name in ("expert", "random", "normal", "screwnet", "ump_di", "bc", "dagger")
-    }
+    further = ("random", "normal", "screwnet", "ump_di", "bc", "dagger")
+    other = {("train", f"policy/{name}") for name in ("expert", *further)}
+    other |= {("view", f"policy/{name}") for name in further}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
-    return [
-        (name, option) for name in ("train", "evaluate") for option in options(name) if (name, option) not in skipped
-    ]
+    return [(name, option) for name in SCHEMAS for option in options(name) if (name, option) not in skipped]
 
 
-@pytest.mark.parametrize("name", ["train", "evaluate"])
-def test_the_defaults_are_valid(name: str) -> None:
+@pytest.mark.parametrize(("name", "schema"), SCHEMAS.items())
+def test_the_defaults_are_valid(name: str, schema: type) -> None:
     cfg = compose(name)
-    assert isinstance(cfg, TrainConfig if name == "train" else EvaluateConfig)
+    assert isinstance(cfg, schema)
     validate(cfg)
 
 
@@ -85,10 +86,10 @@ def test_every_option_of_every_group_is_valid(name: str, option: str) -> None:
 
 
 def test_no_file_is_beside_the_groups() -> None:
-    used = {path for name in ("train", "evaluate") for path in options(name)} | ABSTRACT
+    used = {path for name in SCHEMAS for path in options(name)} | ABSTRACT
     files = {f"{path.parent.name}/{path.stem}" for path in CONF.glob("*/*.yaml")}
     assert used == files
-    assert {path.stem for path in CONF.glob("*.yaml")} == {"train", "evaluate"}
+    assert {path.stem for path in CONF.glob("*.yaml")} == set(SCHEMAS)
 
 
 @pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
@@ -118,12 +119,13 @@ def sources() -> str:
 
 
 def groups_of(schema: type) -> dict[str, type]:
-    return {f.name: getattr(config, str(f.type)) for f in dataclasses.fields(schema) if hasattr(config, str(f.type))}
+    found = {f.name: getattr(config, str(f.type), None) for f in dataclasses.fields(schema)}
+    return {name: group for name, group in found.items() if isinstance(group, type) and dataclasses.is_dataclass(group)}
 
 
 def test_every_key_is_read_by_code() -> None:
     text = sources()
-    for schema in (TrainConfig, EvaluateConfig):
+    for schema in SCHEMAS.values():
         groups = groups_of(schema)
         assert len(groups) >= 5
         for group, content in {**groups, "cfg": schema}.items():
@@ -233,6 +235,14 @@ def test_a_missing_checkpoint_is_named() -> None:
         validate(compose("evaluate", "policy=artflownet"))
 
 
+@pytest.mark.parametrize(
+    ("override", "word"), [("port=0", "port=0"), ("port=70000", "65535"), ("policy=bc", "policy.name")]
+)
+def test_what_the_live_page_cannot_do_is_named(override: str, word: str) -> None:
+    with pytest.raises(UserError, match=re.escape(word)):
+        validate(compose("view", override))
+
+
 def test_infinity_can_be_given() -> None:
     assert compose("train", "env.suction.breaking_force=inf").env.suction.breaking_force == math.inf
 
@@ -253,6 +263,6 @@ def test_documented_commands_are_understood(command: str, tmp_path: Path) -> Non
     script, *words = command.replace("DIR", str(tmp_path)).split()[1:]
     assert (ROOT / script).is_file()
     name, sweep = Path(script).stem, "-m" in words
-    if name in ("train", "evaluate"):
+    if name in SCHEMAS:
         chosen = [word.split(",")[0] if sweep else word for word in words if not word.startswith(("hydra.", "-"))]
         validate(compose(name, *chosen))

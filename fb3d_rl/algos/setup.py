@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import torch
 import yaml
 
+from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.catalog import Entry, partnet_catalog, procedural_catalog
+from fb3d_rl.assets.catalog import Entry, entry_of, folder_entries, partnet_catalog, procedural_catalog
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import UserError
@@ -30,7 +31,7 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig
+    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, ViewConfig
 
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
@@ -53,6 +54,28 @@ def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
         unseen = assets.unseen_categories
         return procedural_catalog(out / "objects", assets.categories, 0, assets.eval_count, seed, unseen)
     return partnet_catalog(assets.root, assets.split, assets.split_file)
+
+
+def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
+    """The object that ``cfg.object`` names; a procedural one is made below ``out``.
+
+    Raises:
+        UserError: it names none, or a folder of several.
+    """
+    word = None if cfg.object is None else str(cfg.object)
+    if word is not None and Path(word).expanduser().is_dir():
+        entries = folder_entries(word)
+        if len(entries) > 1:
+            raise UserError(
+                f"object={word} holds {len(entries)} objects; give one of its folders, or "
+                f"assets=partnet_mobility assets.root={word} object=ID"
+            )
+        return entries[0].load()
+    if cfg.assets.source == "procedural":
+        if word in procedural.FAMILIES:  # whether it is among assets.categories or not
+            return procedural_catalog(out, [word], 0, 1, cfg.seed)[0].load()
+        return entry_of(eval_entries(cfg.assets, out, cfg.seed), word).load()
+    return entry_of(folder_entries(cast(str, cfg.assets.root)), word).load()
 
 
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:

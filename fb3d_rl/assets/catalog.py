@@ -131,6 +131,32 @@ def find_objects(
     return list(objects)
 
 
+def entry_of(entries: Sequence[Entry], word: str | None = None) -> Entry:
+    """The entry that a word names: that of this id, or the first of this category; the first of all without a word.
+
+    Raises:
+        UserError: the word names none of them.
+    """
+    named = [entry for entry in entries if word in (None, entry.id)]
+    found = named or [entry for entry in entries if entry.category == word]
+    if not found:
+        ids, categories = [entry.id for entry in entries], sorted({entry.category for entry in entries})
+        raise UserError(
+            f"object={word} is no folder, none of the {len(ids)} ids ({', '.join(ids[:3])}, ...) and none of the "
+            f"categories {', '.join(categories)}"
+        )
+    return found[0]
+
+
+def folder_entries(root: str | Path) -> list[Entry]:
+    """The objects at or below ``root`` (see :mod:`fb3d_rl.assets.folders`), of no split; none of them is read yet.
+
+    Raises:
+        UserError: no such root, or no object in it.
+    """
+    return [Entry(folder, _category(folder), "") for folder in find_folders(root).values()]
+
+
 def _category(folder: Path) -> str:
     try:
         return read_category(folder)

@@ -6,11 +6,17 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.flow.opening import openable_links, opening_range, start_fraction
+
+TIP = 0.12
+"""How far (m) the suction tip is in front of the hand's origin, along the hand's x axis."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,13 @@ class GripperOptions:
     damping: float = 10000.0
     angular_damping: float = 200.0
     distance: float = 0.6
+
+    def start(self, bounds: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Where the hand's origin is at the start [3] (m), in front of an object within ``bounds`` [2, 3] (m).
+
+        The hand looks along the world's x axis.
+        """
+        return np.array([bounds[0, 0] - self.distance, 0.0, 0.5 * (bounds[0, 2] + bounds[1, 2])])
 
 
 @dataclass(frozen=True)

@@ -300,9 +300,8 @@ class OpenArticulatedEnv(BaseEnv):
         for row, (e, stage) in enumerate(zip(env_idx.tolist(), stages, strict=True)):
             start = torch.tensor(stage.trial.start, dtype=torch.float32)
             state[row, stage.order] = start
-            low, high = stage.model.bounds(stage.trial.start)
-            hand[row, 0] = float(low[0]) - self.options.gripper.distance
-            hand[row, 2] = 0.5 * float(low[2] + high[2])
+            start_position = self.options.gripper.start(stage.model.bounds(stage.trial.start))
+            hand[row, :3] = torch.from_numpy(start_position)
             self._camera_position[e] = torch.as_tensor(stage.model.camera.pose(stage.trial.view)[:3, 3])
             self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
             self._prismatic[e] = stage.object.joint_of(stage.trial.link).type == "prismatic"

@@ -192,8 +192,11 @@ def _specs_of(sample: TensorDictBase) -> Composite:
     return Composite(specs, shape=sample.batch_size, device=sample.device)
 
 
-def require_simulator() -> None:
+def require_simulator(otherwise: str = "leave out the trials: evaluation.trials=0") -> None:
     """Import the simulator, so that a machine without it says so before any work.
+
+    Args:
+        otherwise: what can be done without it.
 
     Raises:
         UserError: ManiSkill or SAPIEN is not installed, or lacks a library of the system.
@@ -203,7 +206,7 @@ def require_simulator() -> None:
     except ImportError as error:
         raise UserError(
             f"the simulator cannot be loaded ({error}); install mani-skill and, for SAPIEN, the system's libX11, "
-            "or leave out the trials: evaluation.trials=0"
+            f"or {otherwise}"
         ) from error
 
 

@@ -72,7 +72,7 @@ class Shot:
         count = len(film.obj.links)
         # The suction cup, the last body, moves with the hand, the first after the links.
         poses = np.concatenate([film.poses, film.poses[:, [count]]], axis=1)
-        meshes = [*(link.visuals for link in film.obj.links), *film.gripper, [_cup(film.gripper)]]
+        meshes = [*(link.visuals for link in film.obj.links), *film.gripper, [cup_mesh(film.gripper)]]
         colors = [*link_colors(film.obj, film.link), *[GRIPPER] * 3]
 
         def bodies(groups: Sequence[Sequence[int]], cup: Color = FREE) -> list[tuple[Body, int]]:
@@ -197,7 +197,7 @@ def _turned(profile: Sequence[tuple[float, float]], sections: int) -> Mesh:
     return Mesh(np.asarray(made.vertices, dtype=np.float64), np.asarray(made.faces, dtype=np.int64))
 
 
-def _cup(gripper: Sequence[Sequence[Mesh]]) -> Mesh:
+def cup_mesh(gripper: Sequence[Sequence[Mesh]]) -> Mesh:
     """A suction cup at the fingers' ends, about the hand's x axis: only to be seen, not felt."""
     end = max(float(mesh.vertices[:, 0].max()) for meshes in gripper for mesh in meshes)
     made = _turned([(0, -0.06), (0.014, -0.06), (0.016, -0.04), (0.036, 0.002), (0, 0.002)], 24)

@@ -28,7 +28,7 @@ PARTLY_OPEN = frozenset({"Door", "Box", "Table", "Phone", "Bucket"})
 """Categories that start 20 % open in the reference protocol; all others start closed."""
 
 
-def _corners(link: Link) -> NDArray[np.float64]:
+def link_corners(link: Link) -> NDArray[np.float64]:
     """Corners [8, 3] of the link's bounding box in its own frame; [0, 3] for a link without a mesh."""
     vertices = [mesh.vertices for mesh in link.visuals]
     if not vertices:
@@ -97,7 +97,7 @@ def travel(obj: ArticulatedObject, joint: int) -> float:
     radius = 0.0
     for carried in _rigid(obj, link):
         pose = to_link @ poses[carried]
-        corners = _corners(obj.links[carried]) @ pose[:3, :3].T + pose[:3, 3]
+        corners = link_corners(obj.links[carried]) @ pose[:3, :3].T + pose[:3, 3]
         radius = max(radius, np.linalg.norm(np.cross(corners, obj.joint_of(link).axis), axis=-1).max(initial=0.0))
     return float(radius * min(upper - lower, np.pi))
 

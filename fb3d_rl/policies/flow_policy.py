@@ -26,6 +26,9 @@ from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
 """Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2, 4 and 5, articulation execution (I.G) is 3."""
 
+PHASES = ("select", "travel", "approach", "pull", "retreat", "release")
+"""Their names."""
+
 TRIES = 6
 """Contact points that are remembered as tried in vain."""
 
@@ -271,6 +274,23 @@ class FlowPolicy(TensorDictModuleBase):
             state[key] = torch.where(where, value, state[key])
         state["phase"] = torch.where(where, TRAVEL, state["phase"])
         state["leave"] = torch.where(where, 0.0, state["leave"])
+
+    @staticmethod
+    def send(state: TensorDictBase, obs: TensorDictBase, chosen: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
+        """Send the hand, which holds nothing, to a contact point that somebody else has chosen.
+
+        Args:
+            state: as of :meth:`initial_state`; written in place.
+            obs: the contract's "observation" group.
+            chosen: as :func:`~fb3d_rl.perception.contact.choose_contact` returns it.
+        """
+        contact, pull, standoff, candidates = chosen
+        state.update({"contact_point": contact, "pull": pull, "standoff": standoff, "candidates": candidates})
+        state["phase"] = torch.full_like(state["phase"], TRAVEL)
+        state["idle"] = torch.zeros_like(state["idle"])
+        state["leave"] = torch.zeros_like(state["leave"])
+        state["tip"] = obs["tool_pose"][..., :3].clone()  # nothing was remembered of where it came from
+        state["came"] = torch.zeros_like(state["came"])
 
     def _choose(self, memories: list[Memory], obs: TensorDictBase, axis: Tensor, flow: Tensor) -> None:
         """Choose a contact point in the environments that are about to, and send them there."""

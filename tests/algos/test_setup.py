@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from fb3d_rl.algos.setup import eval_entries, train_entries
+import pytest
+
+from fb3d_rl.algos.setup import eval_entries, one_object, train_entries
+from fb3d_rl.assets.partnet_mobility import read_category
 from fb3d_rl.config import AssetsConfig
+from fb3d_rl.contract import UserError
 
 
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:
@@ -27,3 +34,47 @@ def test_unseen_categories_are_evaluated_and_not_trained_on(tmp_path: Path) -> N
     assert [(e.category, e.split) for e in train] == [("Laptop", "train_train")] * 2
     assert [(e.category, e.split) for e in held_out] == [("Laptop", "train_test"), ("Box", "test"), ("Bucket", "test")]
     assert [e.id for e in eval_entries(assets, tmp_path / "eval", seed=1)] == [e.id for e in held_out]
+
+
+def test_an_object_is_named_by_its_folder_its_id_or_its_category(
+    tmp_path: Path, procedural_root: Path, config: Callable[[str, list[str]], Any]
+) -> None:
+    microwave = next(path for path in procedural_root.iterdir() if read_category(path) == "Microwave")
+    real = ["assets=partnet_mobility", f"assets.root={procedural_root}"]
+
+    def named(*overrides: str) -> tuple[str, str]:
+        obj = one_object(config("view", list(overrides)), tmp_path)
+        return obj.category, obj.id
+
+    for word in ("Microwave", microwave.name):
+        assert named(*real, f"object={word}") == ("Microwave", microwave.name)
+    assert named(f"object={microwave}") == ("Microwave", microwave.name)
+    assert named(*real)[1] == min(path.name for path in procedural_root.iterdir())
+
+    made = eval_entries(config("view", ["seed=3"]).assets, tmp_path / "all", 3)
+    assert named("seed=3") == (made[0].category, made[0].id)
+    assert named("seed=3", f"object={made[-1].id}") == (made[-1].category, made[-1].id)
+    assert named("object=Laptop")[0] == "Laptop", "a family that assets.categories lacks"
+    numbers = shutil.copytree(microwave, tmp_path / "root" / "10098")
+    assert named("assets=partnet_mobility", f"assets.root={numbers.parent}", "object=10098")[1] == "10098"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["object=Spaceship"], ["Spaceship", "Microwave"]),
+        (["assets=partnet_mobility", "assets.root=ROOT", "object=Laptop"], ["Laptop", "3 ids", "KitchenPot"]),
+        (["object=ROOT"], ["holds 3 objects", "object=ID"]),
+        (["assets=partnet_mobility", "assets.root=nowhere"], ["assets.root", "nowhere"]),
+    ],
+)
+def test_an_object_that_is_not_there_is_named(
+    tmp_path: Path,
+    procedural_root: Path,
+    config: Callable[[str, list[str]], Any],
+    overrides: list[str],
+    words: list[str],
+) -> None:
+    with pytest.raises(UserError) as error:
+        one_object(config("view", [word.replace("ROOT", str(procedural_root)) for word in overrides]), tmp_path)
+    assert all(word in str(error.value) for word in words), error.value

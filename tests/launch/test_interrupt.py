@@ -62,3 +62,26 @@ def test_nothing_is_left_behind(tmp_path: Path, after: float) -> None:
     assert group(process.pid) == []
     lines = (tmp_path / "stderr").read_text().splitlines()
     assert len(lines) == 1 and lines[0].startswith("error: interrupted"), lines
+
+
+@pytest.mark.slow
+def test_the_live_page_ends_without_a_word(tmp_path: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
+    command = [sys.executable, str(ROOT / "launch" / "view.py"), "port=18080"]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        while "http://127.0.0.1:" not in (line := process.stdout.readline()):
+            assert line, process.stderr.read()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+        assert process.stderr.read() == ""
+    assert not list(tmp_path.iterdir())

@@ -77,7 +77,10 @@ def test_evaluation_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-@pytest.mark.parametrize("script", ["train.py", pytest.param("evaluate.py", marks=pytest.mark.slow), "report.py"])
+@pytest.mark.parametrize(
+    "script",
+    ["train.py", "report.py", *(pytest.param(name, marks=pytest.mark.slow) for name in ("evaluate.py", "view.py"))],
+)
 def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> None:
     result = launch(script, "--help", cwd=tmp_path, python=("-X", "importtime"))
     assert result.returncode == 0 and result.stdout
@@ -92,6 +95,23 @@ def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> No
 )
 def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     sentence = sentence_of(launch("benchmark.py", *arguments, cwd=tmp_path))
+    assert all(word in sentence for word in words), sentence
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["object=Spaceship"], ["Spaceship", "Microwave"]),
+        pytest.param(["port=99999"], ["port=99999", "65535"], marks=pytest.mark.slow),
+        pytest.param(["checkpoint=nowhere.safetensors"], ["nowhere.safetensors"], marks=pytest.mark.slow),
+    ],
+)
+def test_the_live_page_says_what_is_wrong_and_leaves_nothing(
+    tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
+    pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
+    sentence = sentence_of(launch("view.py", *arguments, cwd=tmp_path))
     assert all(word in sentence for word in words), sentence
     assert not list(tmp_path.iterdir())
 
