@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import http.client
 import math
+import re
 import shutil
 import socket
 import threading
@@ -22,7 +24,8 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.evaluation.live import page as pages
-from fb3d_rl.evaluation.live.page import HOST, Page, serve
+from fb3d_rl.evaluation.live.page import Page, serve
+from fb3d_rl.evaluation.live.server import HOST, start_server
 from fb3d_rl.evaluation.live.session import Session
 from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.flow.metrics import flow_metrics
@@ -248,8 +251,8 @@ def test_viser_is_asked_for(monkeypatch: pytest.MonkeyPatch, oven: Session) -> N
 
 @pytest.fixture
 def server() -> Iterator[Any]:
-    viser = pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
-    made = viser.ViserServer(host=HOST, port=free_port(), verbose=False)
+    pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
+    made = start_server(free_port(), "test")
     yield made
     made.stop()
 
@@ -338,6 +341,30 @@ def test_it_listens_on_this_machine_alone_and_on_the_port_that_it_names(served: 
     assert f"port {port} is taken" in printed
     named = int(printed.split(f"http://{HOST}:")[1].split()[0])
     assert named != port and listening(named) == ["0100007F"]
+
+
+def answer(server: Any, path: str) -> tuple[int, str]:
+    """Status and text of what the server has at ``path``, which is asked for as it stands, dots and all."""
+    connection = http.client.HTTPConnection(HOST, server.get_port(), timeout=10)
+    connection.request("GET", path)
+    response = connection.getresponse()
+    found = response.status, response.read().decode(errors="replace")
+    connection.close()
+    return found
+
+
+def test_the_page_loads_nothing_from_elsewhere(server: Any) -> None:
+    for path in ("/", "/index.html", "/./index.html"):
+        status, page = answer(server, path)
+        assert status == 200 and "<script" in page
+        assert not re.search(r'\b(src|href)="(https?:)?//', page)
+
+
+def test_no_file_but_the_pages_own_is_given_away(server: Any, tmp_path: Path) -> None:
+    (tmp_path / "secret.txt").write_text("mine")
+    for path in ("/" + "../" * 20 + str(tmp_path / "secret.txt")[1:], "/../index.html", "/assets/../../index.html"):
+        assert answer(server, path)[0] == 404, path
+    assert answer(server, "/nothing.js")[0] == 404
 
 
 @pytest.mark.slow

@@ -10,13 +10,11 @@ loop that owns the session fulfils it. Of a slider's many positions only the las
 
 from __future__ import annotations
 
-import io
 import logging
 import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout
 from functools import partial
 from typing import Any
 
@@ -28,12 +26,10 @@ from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.camera.shade import GRIPPER, Color, link_colors, srgb
 from fb3d_rl.camera.views import View, look_at
 from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation.live.server import HOST, start_server
 from fb3d_rl.evaluation.live.session import Moment, Session
 from fb3d_rl.evaluation.video import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
 from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
-
-HOST = "127.0.0.1"
-"""Only this machine reaches the page: whoever does may run the policy."""
 
 COLORS: dict[str, Color] = {"predicted": FLOW, "true": srgb("#2c9f5b")}
 """Of the arrows of each flow."""
@@ -75,10 +71,10 @@ def serve(session: Session, port: int, until: Callable[[], bool] = lambda: False
     Raises:
         UserError: viser is not installed.
     """
-    viser, name = require_viser(), f"{session.obj.category} {session.obj.id}"
+    require_viser()
+    name = f"{session.obj.category} {session.obj.id}"
     logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers open connections that they do not use
-    with redirect_stdout(io.StringIO()):  # it has a banner of its own
-        server = viser.ViserServer(host=HOST, port=port, label=name, verbose=False)
+    server = start_server(port, name)
     try:
         page = Page(server, session)
         taken = "" if server.get_port() == port else f" (port {port} is taken)"
