@@ -441,10 +441,9 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("evaluation.goal", cfg.evaluation.goal, ("open", "state"))
     if cfg.evaluation.decision_seconds is not None:
         _positive("evaluation.decision_seconds", cfg.evaluation.decision_seconds)
-    if cfg.evaluation.goal == "state" and cfg.policy.name in ("bc", "dagger"):
-        raise UserError(
-            f"policy={cfg.policy.name} has learned to open; evaluation.goal=state is for policies of a flow"
-        )
+    acting = cfg.algo.name if isinstance(cfg, TrainConfig) else cfg.policy.name
+    if cfg.evaluation.goal == "state" and acting in ("bc", "dagger"):
+        raise UserError(f"{acting} learns to open only; evaluation.goal=state is for policies of a flow")
     for key in ("closed_share", "others_closed", "all_parts_share", "some_parts_share"):
         if not 0 <= getattr(cfg.data, key) <= 1:
             raise UserError(f"data.{key}={getattr(cfg.data, key)} is no share; give a number from 0 to 1")

@@ -243,6 +243,13 @@ def test_what_the_live_page_cannot_do_is_named(override: str, word: str) -> None
         validate(compose("view", override))
 
 
+def test_what_learns_to_open_has_no_other_goal() -> None:
+    validate(compose("train", "algo=artflownet", "protocol=goal_state"))
+    for name, words in {"train": ["algo=bc"], "evaluate": ["policy=dagger", "checkpoint=x.pt"]}.items():
+        with pytest.raises(UserError, match="learns to open only"):
+            validate(compose(name, *words, "protocol=goal_state"))
+
+
 def test_infinity_can_be_given() -> None:
     assert compose("train", "env.suction.breaking_force=inf").env.suction.breaking_force == math.inf
 

@@ -149,6 +149,7 @@ def test_an_interrupted_evaluation_goes_on_from_its_rows(
         run_evaluation(config("evaluate", [*words, "resume=true"]), cut)
 
 
+@pytest.mark.slow
 def test_training_and_flow_metrics_need_no_simulator(tmp_path: Path) -> None:
     launch = Path(CONF).parent / "launch"
     overrides = [item for item in SMALL if not item.startswith("evaluation.")]
