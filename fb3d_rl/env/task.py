@@ -72,8 +72,8 @@ class OpenArticulatedEnv(BaseEnv):
 
     **Success Conditions:**
     - the normalized distance |q_goal - q| / |q_goal - q_start| of the part's joint is below ``options.success``;
-      q_goal is the joint limit that opens. The episode then terminates; it is truncated after ``options.horizon``
-      control steps.
+      q_goal is the trial's, or the joint limit that opens. The episode then terminates; it is truncated after
+      ``options.horizon`` control steps.
 
     Args:
         objects: what stands in the scene: objects, a PartNet-Mobility folder of one object or of many; a few procedural
@@ -294,6 +294,7 @@ class OpenArticulatedEnv(BaseEnv):
             self._camera_position = torch.zeros(self.num_envs, 3, device=self.device)
             self._target = torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
             self._start, self._goal = torch.zeros(2, self.num_envs, 1, device=self.device)
+            self._opens = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
             self._prismatic = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         state = torch.zeros(len(stages), int(self.articulation.max_dof))
         hand = torch.zeros(len(stages), ACTION_DIM)
@@ -304,6 +305,7 @@ class OpenArticulatedEnv(BaseEnv):
             hand[row, :3] = torch.from_numpy(start_position)
             self._camera_position[e] = torch.as_tensor(stage.model.camera.pose(stage.trial.view)[:3, 3])
             self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
+            self._opens[e] = stage.trial.goal is None
             self._prismatic[e] = stage.object.joint_of(stage.trial.link).type == "prismatic"
             self._contact[e], self._force[e] = False, 0.0
             if hasattr(stage, "suction"):
@@ -384,8 +386,9 @@ class OpenArticulatedEnv(BaseEnv):
     def evaluate(self) -> dict[str, Tensor]:
         """Metrics: normalized_distance [E, 1], contact [E, 1] (suction has held the part) and success [E]."""
         self._position = self.joint_positions().gather(1, self._target)
-        # Signed, so that a part pushed past its limit by the solver's slack counts as open.
-        distance = ((self._goal - self._position) / (self._goal - self._start)).clamp_min(0.0)
+        signed = (self._goal - self._position) / (self._goal - self._start)
+        # Past the limit, by the solver's slack, a part is open; past a goal within the range it has missed it.
+        distance = torch.where(self._opens, signed.clamp_min(0.0), signed.abs())
         return {
             "normalized_distance": distance,
             "contact": self._contact.clone(),

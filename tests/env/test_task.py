@@ -412,3 +412,23 @@ def test_the_hand_reaches_into_a_hollow_body_but_not_through_its_walls(objects: 
         env.step(velocity(x=2.0))
     tip = float(env.agent.tool_pose()[0, 0])
     assert front + 0.1 < tip < back
+
+
+@pytest.mark.parametrize("past", [-0.2, 0.05, 0.2])
+def test_a_part_that_went_past_a_goal_within_the_range_has_missed_it(
+    objects: dict[str, ArticulatedObject], past: float
+) -> None:
+    """Past the limit that opens it is open; there the sign counts."""
+    table = objects["Table"]
+    env = OpenArticulatedEnv([table], EnvOptions(points=64))
+    link = openable_links(table)[0]
+    for goal, fraction, expected in ((0.5, 0.1, abs(past)), (0.5, 0.9, abs(past)), (None, 0.1, max(0.0, -past))):
+        trial = default_trial(table, link, fraction=fraction, goal=goal)
+        env.reset(options={"trials": [trial]})
+        stage = env.stages[0]
+        state = torch.tensor(trial.start)
+        state[stage.target] = stage.goal + past * (stage.goal - trial.start[stage.target])
+        set_joints(env, state)
+        metrics = env.evaluate()
+        assert float(metrics["normalized_distance"]) == pytest.approx(expected, abs=1e-4)
+        assert bool(metrics["success"]) == (expected < 0.1)
