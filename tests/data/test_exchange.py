@@ -125,7 +125,7 @@ def test_strangers_data_become_the_experts(tmp_path: Path, buffer: Demonstration
     maniskill.write(buffer, tmp_path / "x.h5")
     with h5py.File(tmp_path / "x.h5", "a") as file:
         for group in file.values():
-            del group[maniskill.OWN]
+            del group[maniskill.OWN], group["obs/observation/goal_sense"]
     about = json.loads((tmp_path / "x.json").read_text())
     for entry in (about, *about["episodes"]):
         del entry[maniskill.OWN]
@@ -140,6 +140,7 @@ def test_strangers_data_become_the_experts(tmp_path: Path, buffer: Demonstration
         assert all(info.start == () for info in strange.episodes)
         assert torch.equal(strange[range(20)]["action"], buffer[range(20)]["action"])
     rows = read[0][range(20)]
+    assert bool((rows["observation", "goal_sense"] == 1).all()), "who says nothing of a goal opens"
     assert torch.equal(rows["expert", "action"], rows["action"]) and bool(rows["expert", "acts"].all())
     assert rows["elapsed_steps"].flatten().tolist() == [t for steps in LENGTHS for t in range(steps)]
     assert {key: read[0].keys[key] for key in buffer.keys} == buffer.keys, "trained on together with our own"
