@@ -79,7 +79,7 @@ def _one_sentence() -> Iterator[None]:
             raise
         fail(f"{error.filename} cannot be written or read ({error.strerror}); choose another folder: hydra.run.dir=DIR")
     except KeyboardInterrupt:
-        fail("interrupted; a run folder with a checkpoint.pt goes on with: resume=true hydra.run.dir=FOLDER")
+        fail("interrupted; a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER")
 
 
 def fail(sentence: str) -> None:
