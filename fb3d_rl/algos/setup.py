@@ -19,7 +19,7 @@ from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
+from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
@@ -160,7 +160,7 @@ def protocol(cfg: CommandConfig) -> Protocol:
         videos=cfg.evaluation.videos,
         seed=cfg.seed,
         schedule=ScheduleOptions(
-            cast(Literal["reference", "closed", "random"], cfg.evaluation.start),
+            cast(Start, cfg.evaluation.start),
             cast(Literal["open", "state"], cfg.evaluation.goal),
             cfg.evaluation.repeats,
         ),

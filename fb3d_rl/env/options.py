@@ -107,7 +107,7 @@ class EnvOptions:
     suction: SuctionOptions = field(default_factory=SuctionOptions)
     camera: CameraOptions = field(default_factory=CameraOptions)
     views: ViewRange = field(default_factory=ViewRange)
-    start: Literal["reference", "closed", "random"] = "reference"
+    start: Start = "reference"
     points: int = 1200
     horizon: int = 150
     success: float = 0.1
@@ -138,6 +138,17 @@ class Trial:
     view: View
     seed: int = 0
     goal: float | None = None
+
+
+Start = Literal["reference", "closed", "random"]
+"""How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""
+
+
+def drawn_fraction(start: Start, rng: np.random.Generator) -> float | None:
+    """How far a part is open at the start of a trial, for :func:`default_trial`; draws for "random" alone."""
+    if start == "random":
+        return float(rng.uniform(0.0, 0.9))
+    return 0.0 if start == "closed" else None
 
 
 def default_trial(

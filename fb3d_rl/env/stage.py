@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -26,7 +25,7 @@ from fb3d_rl.env.gripper import gripper_meshes
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.suction import Suction
 from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
+from fb3d_rl.flow.opening import box_bounds, box_corners, openable_links, opening_range, standing_pose
 
 if TYPE_CHECKING:
     from mani_skill.envs.scene import ManiSkillScene
@@ -143,19 +142,11 @@ class Model:
 
     @cached_property
     def _corners(self) -> NDArray[np.float64]:
-        """Corners [L, 8, 4] (homogeneous, in its frame) of each link's bounding box; nan for a link without a mesh."""
-        corners = np.full((len(self.object.links), 8, 4), np.nan)
-        for row, link in zip(corners, self.object.links, strict=True):
-            if link.visuals:
-                points = np.concatenate([mesh.vertices for mesh in link.visuals])
-                row[:, :3] = list(itertools.product(*np.stack([points.min(0), points.max(0)]).T))
-                row[:, 3] = 1.0
-        return corners
+        return box_corners(self.object)
 
     def bounds(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
         """Bounds [2, 3] (m, world) of the links' bounding boxes at a joint state [J]."""
-        points = (self._corners @ self.poses(state).swapaxes(1, 2))[..., :3].reshape(-1, 3)
-        return np.stack([np.nanmin(points, 0), np.nanmax(points, 0)])
+        return box_bounds(self._corners, self.poses(state))
 
 
 class Stage:

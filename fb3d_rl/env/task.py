@@ -29,7 +29,7 @@ from fb3d_rl.camera.sapien import SENSOR, SapienCamera, add_visuals, camera_conf
 from fb3d_rl.camera.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
 from fb3d_rl.contract import ACTION_DIM, UserError
 from fb3d_rl.env.gripper import BODIES, FINGERS, TOOL, FloatingSuctionGripper
-from fb3d_rl.env.options import EnvOptions, Trial, default_trial
+from fb3d_rl.env.options import EnvOptions, Trial, default_trial, drawn_fraction
 from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage
 from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
@@ -202,12 +202,12 @@ class OpenArticulatedEnv(BaseEnv):
             what = "no part that opens" if self.link is None else f"no part that opens and is called {self.link!r}"
             raise UserError(f"the objects have {what}; choose other objects: {', '.join(names[:5])}")
         link, seed = int(rng.choice(links)), int(rng.integers(2**31))
-        fraction = float(rng.uniform(0.0, 0.9)) if self.options.start == "random" else None
+        fraction = drawn_fraction(self.options.start, rng)
         for _ in range(VIEW_TRIES):
             view = self.options.views.sample(rng)
             if stage is not None and self.scene.can_render():
                 view = stage.trial.view
-            trial = default_trial(model.object, link, view, seed, 0.0 if self.options.start == "closed" else fraction)
+            trial = default_trial(model.object, link, view, seed, fraction)
             # The hand is far away, where it hides nothing.
             poses = np.concatenate([model.poses(trial.start), np.tile(np.eye(4), (len(BODIES), 1, 1))])
             poses[len(model.object.links) :, 2, 3] = -1e3

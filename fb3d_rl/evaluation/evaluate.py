@@ -110,7 +110,7 @@ def evaluate(
         for name, policy in policies.items() if scheduled else ():
             done = _done(name, before, scheduled)
             task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
-            keep = partial(_keep, out / "rows.csv", rows, done, lambda: bar.advance(task))  # noqa: B023, used at once
+            keep = partial(_keep, out / "rows.csv", rows, done, partial(bar.advance, task))
             timing = _run(name, policy, shown, scheduled, protocol, done, keep)
             rows += [done[number] for number in sorted(done)]
             if timing:

@@ -11,21 +11,34 @@ import plotly.graph_objects as go
 from fb3d_rl.evaluation import page
 from fb3d_rl.evaluation.blocks import broken
 from fb3d_rl.evaluation.page import text
-from fb3d_rl.evaluation.rows import TrialRow
+from fb3d_rl.evaluation.rows import (
+    CRASHED,
+    LOST,
+    NEVER_HELD,
+    NEVER_TOUCHED,
+    STUCK,
+    TIMED_OUT,
+    TOO_SLOW,
+    WRONG_WAY,
+    TrialRow,
+)
 
 SUCCESS, SCHEDULED, TOUCHED, HELD = "success", "scheduled", "touched", "held"
 
+NOT_FAR = "held, but not opened far enough"
+"""What rows said of trials before they told stuck, wrong direction and timed out apart."""
+
 ENDS = {
     SUCCESS: "#2f9e77",
-    "timed out": "#dcb13c",
-    "held, but not opened far enough": "#c98b2b",
-    "stuck": "#e0782f",
-    "wrong direction": "#c2548f",
-    "lost hold": "#8b63cf",
-    "touched, but never held the part": "#3b7dd8",
-    "never touched the part": "#4fa3b5",
-    "took too long": "#9a7059",
-    "crashed": "#d1495b",
+    TIMED_OUT: "#dcb13c",
+    NOT_FAR: "#c98b2b",
+    STUCK: "#e0782f",
+    WRONG_WAY: "#c2548f",
+    LOST: "#8b63cf",
+    NEVER_HELD: "#3b7dd8",
+    NEVER_TOUCHED: "#4fa3b5",
+    TOO_SLOW: "#9a7059",
+    CRASHED: "#d1495b",
 }
 """How trials end, from the best to the worst, with the colours of these ends."""
 
@@ -36,19 +49,19 @@ _THROUGH = "rgba(128, 140, 158, 0.32)"
 _STAGE = "#98a2b3"
 
 _SHORT = {
-    "touched, but never held the part": "never held",
-    "never touched the part": "never touched",
-    "held, but not opened far enough": "not far enough",
+    NEVER_HELD: "never held",
+    NEVER_TOUCHED: "never touched",
+    NOT_FAR: "not far enough",
 }
 """Ends as the flow chart names them: the stage before tells the rest."""
 
 _HEIGHT, _GAP = 270, 20
 """Height (pixels) of the flow chart, and of the gap between two nodes of it."""
 
-_FORMER = {"held at the end": "held, but not opened far enough"}
+_FORMER = {"held at the end": NOT_FAR}
 """What early versions called an end."""
 
-_APART = ("crashed", "took too long")
+_APART = (CRASHED, TOO_SLOW)
 """Ends that tell nothing about the stages before."""
 
 
@@ -60,7 +73,7 @@ def end(row: TrialRow) -> str:
     if row.success:
         return SUCCESS
     reason = re.sub(r", -?\d+ % open$", "", row.failure)
-    return _FORMER.get(reason, reason) or ("crashed" if row.status == "error" else "no reason given")
+    return _FORMER.get(reason, reason) or (CRASHED if row.status == "error" else "no reason given")
 
 
 def stages(row: TrialRow) -> tuple[str, ...]:
@@ -70,7 +83,7 @@ def stages(row: TrialRow) -> tuple[str, ...]:
         return SCHEDULED, last
     if row.contact:
         return SCHEDULED, TOUCHED, HELD, last
-    if last in (SUCCESS, "touched, but never held the part"):
+    if last in (SUCCESS, NEVER_HELD):
         return SCHEDULED, TOUCHED, last
     return SCHEDULED, last
 

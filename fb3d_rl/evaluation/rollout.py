@@ -173,7 +173,7 @@ def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
 
 
 def _failure(after: TensorDictBase, held: bool, control_freq: int) -> str:
-    """Why the part was not opened in an episode; see :data:`~fb3d_rl.evaluation.rows.FAILURES`."""
+    """Why the part was not opened in an episode; see :mod:`fb3d_rl.evaluation.rows`."""
     if not held:
         touched = bool((after["observation", "contact_force"] > 0).any())
         return NEVER_HELD if touched else NEVER_TOUCHED

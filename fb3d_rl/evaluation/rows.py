@@ -17,25 +17,23 @@ from typing import Any, Literal, TypeVar
 from fb3d_rl.contract import UserError
 from fb3d_rl.files import write_text
 
+# Why a part was not opened.
 NEVER_TOUCHED = "never touched the part"
+"""The gripper met nothing."""
 NEVER_HELD = "touched, but never held the part"
+"""It met something, but suction never held the part."""
 LOST = "lost hold"
+"""Suction held the part, but not at the end."""
 WRONG_WAY = "wrong direction"
+"""Held at the end, farther from the goal than at the start (by more than 1 % of the way)."""
 STUCK = "stuck"
+"""Held at the end, and moved by less than 1 % of the way in the last second."""
 TIMED_OUT = "timed out"
+"""Held at the end and still moving."""
 CRASHED = "crashed"
+"""An exception or a dead process ended the trial."""
 TOO_SLOW = "took too long"
-FAILURES = {
-    NEVER_TOUCHED: "the gripper met nothing",
-    NEVER_HELD: "it met something, but suction never held the part",
-    LOST: "suction held the part, but not at the end",
-    WRONG_WAY: "held at the end, farther from the goal than at the start (by more than 1 % of the way)",
-    STUCK: "held at the end, and moved by less than 1 % of the way in the last second",
-    TIMED_OUT: "held at the end and still moving",
-    CRASHED: "an exception or a dead process ended the trial",
-    TOO_SLOW: "one decision of the policy took longer than evaluation.decision_seconds",
-}
-"""Why a part was not opened, with what that means."""
+"""One decision of the policy took longer than evaluation.decision_seconds."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class TrialRow:
         success: normalized distance below 0.1 at the end.
         normalized_distance: |q_goal - q| / |q_goal - q_start| at the end.
         attach_step: control step at which suction took hold, -1 if never.
-        failure: one of :data:`FAILURES`, "" on success.
+        failure: why the part was not opened, one of this module's constants; "" on success.
         repeat: which of the repetitions of a protocol that has several.
         seconds: simulated time until success, else until the end, s; -1 if it was not recorded.
         path_length: way of the suction tip, m; -1 if it was not recorded.

@@ -13,7 +13,7 @@ import numpy as np
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
-from fb3d_rl.env.options import Trial, default_trial
+from fb3d_rl.env.options import Start, Trial, default_trial, drawn_fraction
 from fb3d_rl.perception.cloud import MIN_VISIBLE
 
 
@@ -42,7 +42,7 @@ class ScheduleOptions:
         repeats: trials of each part, each with a view and a seed of its own.
     """
 
-    start: Literal["reference", "closed", "random"] = "reference"
+    start: Start = "reference"
     goal: Literal["open", "state"] = "open"
     repeats: int = 1
 
@@ -53,9 +53,7 @@ class ScheduleOptions:
             while abs(goal - start) < 0.3:
                 start, goal = rng.random(2)
             return {"fraction": float(start), "goal": float(goal)}
-        if self.start == "random":
-            return {"fraction": 0.9 * float(rng.random())}
-        return {"fraction": 0.0 if self.start == "closed" else None}
+        return {"fraction": drawn_fraction(self.start, rng)}
 
 
 def schedule(

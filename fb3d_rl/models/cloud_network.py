@@ -55,8 +55,12 @@ class CloudNetwork(nn.Module):
         self.part_mask_input = part_mask_input
         self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors, "backbone": backbone}
         self.network = BACKBONES[backbone](inputs=int(part_mask_input), outputs=self.OUTPUTS, neighbors=neighbors)
+        self.add_layers()
         if generator is not None:
-            initialize(self.network, generator)
+            initialize(self, generator)
+
+    def add_layers(self) -> None:
+        """Make what a network has beside its PointNet++: nothing, here."""
 
     def per_point(self, points: Tensor, valid: Tensor, part_mask: Tensor) -> Tensor:
         """Points [B, N, 3] f32 (m, world axes), valid [B, N] bool and part_mask [B, N] bool -> [B, N, OUTPUTS]; 0 on

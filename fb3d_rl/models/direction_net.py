@@ -13,7 +13,6 @@ from torch import Tensor
 from fb3d_rl.geometry.points import gather
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.cloud_network import CloudNetwork
-from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import mlp
 
 
@@ -35,17 +34,9 @@ class DirectionNet(CloudNetwork):
     NAME = "ump_di"
     OUTPUTS = 64
 
-    def __init__(
-        self,
-        part_mask_input: bool = True,
-        neighbors: int = 64,
-        backbone: str = "pointnet2",
-        generator: torch.Generator | None = None,
-    ) -> None:
-        super().__init__(part_mask_input, neighbors, backbone, generator)
+    def add_layers(self) -> None:
+        """See the base class."""
         self.head = mlp(self.OUTPUTS + 3, 128, 128, 1)
-        if generator is not None:
-            initialize(self.head, generator)
 
     def score(self, told: Tensor, directions: Tensor) -> Tensor:
         """Scores [..., S] of directions [..., S, 3] at points that :meth:`per_point` told of [..., OUTPUTS]."""

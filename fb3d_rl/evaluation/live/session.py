@@ -28,7 +28,7 @@ from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.evaluation.rollout import policy_env
 from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.flow.metrics import flow_metrics
-from fb3d_rl.flow.opening import link_corners
+from fb3d_rl.flow.opening import box_bounds, box_corners
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.perception.contact import choose_contact
 from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
@@ -265,11 +265,7 @@ class Session:
         points, links = object_view.cloud(qpos, trial.view, self._points, np.random.default_rng([trial.seed, 0]))
         frame = object_view.sample(links, points, qpos, trial.link)[None]
         poses = object_view.poses(qpos).numpy()
-        corners = [
-            link_corners(link) @ pose[:3, :3].T + pose[:3, 3] for link, pose in zip(self.obj.links, poses, strict=True)
-        ]
-        stacked = np.concatenate(corners)
-        tip = self._env_options.gripper.start(np.stack([stacked.min(0), stacked.max(0)])) + [TIP, 0, 0]
+        tip = self._env_options.gripper.start(box_bounds(box_corners(self.obj), poses)) + [TIP, 0, 0]
         frame["observation", "tool_pose"] = torch.tensor([[*tip, 1, 0, 0, 0]], dtype=torch.float32)
         camera = object_view.camera.pose(trial.view)[:3, 3]
         frame["observation", "camera_position"] = torch.tensor(camera[None], dtype=torch.float32)
