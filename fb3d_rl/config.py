@@ -27,7 +27,8 @@ class AssetsConfig:
             those that are trained on besides.
         unseen_categories: families of procedural objects that are only evaluated on, as the split "test".
         train_count: procedural training objects of each category.
-        eval_count: procedural held-out objects of each category.
+        eval_count: procedural held-out objects of each category; with "partnet_mobility" 0, or the splits
+            "procedural_train_test" and "procedural_test" besides the real ones.
     """
 
     source: str
@@ -425,7 +426,7 @@ def validate(cfg: CommandConfig) -> None:
     _at_least("data.points", cfg.data.points, 64)
     _at_least("data.eval_samples", cfg.data.eval_samples, 1)
     _at_least("data.workers", 0 if cfg.data.workers is None else cfg.data.workers, 0)
-    _at_least("assets.eval_count", cfg.assets.eval_count, 1)
+    _at_least("assets.eval_count", cfg.assets.eval_count, 1 if cfg.assets.source == "procedural" else 0)
     _at_least("camera.resolution", cfg.camera.resolution, 8)
     if not 0 < cfg.camera.fov < 180:
         raise UserError(f"camera.fov={cfg.camera.fov} is no field of view; give degrees between 0 and 180")

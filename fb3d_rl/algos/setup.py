@@ -36,24 +36,35 @@ if TYPE_CHECKING:
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
     """Objects to train on and objects to evaluate on."""
+    made = _made(assets, out, seed, assets.train_count)
+    train = [entry for entry in made if entry.split == "train_train"]
+    held_out = [entry for entry in made if entry.split != "train_train"]
     if assets.source == "procedural":
-        unseen = assets.unseen_categories
-        made = procedural_catalog(
-            out / "objects", assets.categories, assets.train_count, assets.eval_count, seed, unseen
-        )
-        return [e for e in made if e.split == "train_train"], [e for e in made if e.split != "train_train"]
-    train = partnet_catalog(assets.root, assets.split, assets.split_file)
-    if assets.categories:
-        train += procedural_catalog(out / "objects", assets.categories, assets.train_count, 0, seed)
-    return train, partnet_catalog(assets.root, assets.eval_split, assets.split_file)
+        return train, held_out
+    train = partnet_catalog(assets.root, assets.split, assets.split_file) + train
+    return train, partnet_catalog(assets.root, assets.eval_split, assets.split_file) + _beside_real(held_out)
 
 
 def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
     """Objects to evaluate on."""
+    made = _made(assets, out, seed, 0)
     if assets.source == "procedural":
-        unseen = assets.unseen_categories
-        return procedural_catalog(out / "objects", assets.categories, 0, assets.eval_count, seed, unseen)
-    return partnet_catalog(assets.root, assets.split, assets.split_file)
+        return made
+    return partnet_catalog(assets.root, assets.split, assets.split_file) + _beside_real(made)
+
+
+def _made(assets: AssetsConfig, out: Path, seed: int, train_count: int) -> list[Entry]:
+    """The procedural objects, if there are to be any."""
+    if assets.source != "procedural" and not (assets.categories or assets.unseen_categories):
+        return []
+    return procedural_catalog(
+        out / "objects", assets.categories, train_count, assets.eval_count, seed, assets.unseen_categories
+    )
+
+
+def _beside_real(entries: list[Entry]) -> list[Entry]:
+    """The same with splits of their own, so that no number mixes them with PartNet-Mobility's."""
+    return [replace(entry, split=f"procedural_{entry.split}") for entry in entries]
 
 
 def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:

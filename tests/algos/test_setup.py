@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,32 @@ from fb3d_rl.contract import UserError
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:
     microwaves = [path.name for path in procedural_root.glob("*Microwave*")]
     root, out = str(procedural_root), tmp_path / "run"
-    mixed = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 1)
+    mixed = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 0)
     train, held_out = train_entries(mixed, out, seed=1)
     assert sorted(e.category for e in train) == ["Laptop"] * 3 + ["Microwave"] * len(microwaves)
     assert held_out and {e.category for e in held_out} == {"KitchenPot"}
 
-    alone = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 1)
+    alone = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 0)
     assert [e.id for e in train_entries(alone, tmp_path / "alone", seed=1)[0]] == sorted(microwaves)
     assert not (tmp_path / "alone").exists()
+
+
+def test_procedural_objects_beside_real_ones_are_evaluated_as_splits_of_their_own(
+    tmp_path: Path, procedural_root: Path
+) -> None:
+    root = str(procedural_root)
+    both = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], ["Box"], 2, 1)
+    train, held_out = train_entries(both, tmp_path / "train", seed=1)
+    assert {(e.category, e.split) for e in train if e.category != "Microwave"} == {("Laptop", "train_train")}
+    real, made = held_out[:-2], held_out[-2:]
+    assert {e.category for e in real} == {"KitchenPot"}
+    assert [(e.category, e.split) for e in made] == [("Laptop", "procedural_train_test"), ("Box", "procedural_test")]
+    assert not {e.id for e in train} & {e.id for e in held_out}
+    again = eval_entries(replace(both, split="KitchenPot"), tmp_path / "eval", seed=1)
+    assert [(e.id, e.split) for e in again] == [(e.id, e.split) for e in held_out], "launch/evaluate.py has the same"
+
+    with pytest.raises(UserError, match=r"assets\.categories: the list is empty"):
+        train_entries(replace(both, categories=[]), tmp_path / "none", seed=1)
 
 
 def test_unseen_categories_are_evaluated_and_not_trained_on(tmp_path: Path) -> None:
