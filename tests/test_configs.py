@@ -37,6 +37,8 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("view", "assets/mixed"): ["assets.root=."],
     ("train", "assets/mixed"): ["assets.root=."],
     ("evaluate", "assets/mixed"): ["assets.root=."],
+    ("train", "experiment/comparison_partnet"): ["assets.root=."],
+    ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/ump_di"): ["checkpoint=checkpoint.pt"],
@@ -94,7 +96,7 @@ def test_no_file_is_beside_the_groups() -> None:
 
 @pytest.mark.parametrize("experiment", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
 def test_every_experiment_changes_something_and_is_valid(experiment: str) -> None:
-    cfg = compose("train", f"experiment={experiment}")
+    cfg = compose("train", f"experiment={experiment}", *NEEDS.get(("train", f"experiment/{experiment}"), []))
     validate(cfg)
     assert (cfg == compose("train")) == (experiment == "none")
 
