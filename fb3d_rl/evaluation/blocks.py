@@ -21,6 +21,9 @@ READING = (
     ("Normalized distance", "share of the way to fully open that is left at the end: 0 open, 1 unmoved."),
     ("Success", "normalized distance below 0.1. A trial that crashed counts as a failure."),
     ("Contact", "suction held the part to open; motion-only success is success among these trials."),
+    ("What it took", "steps and simulated seconds until success are means over the trials that succeeded, the way of "
+     "the gripper's tip and how often it lost its hold over all; the wall time of a decision is the median on the "
+     "machine of the run."),
     ("Expert", "follows the true flow: what a policy could reach with perfect predictions."),
     ("Numbers", "means over objects with a 95 % interval; class means are over categories."),
 )  # fmt: skip
@@ -66,9 +69,23 @@ def terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
         "Normalized distance": bool(names),
         "Success": bool(names),
         "Contact": bool(names),
+        "What it took": any(tables.effort_of(numbers, tables.policies_of(numbers)) for numbers in summaries),
         "Expert": "expert" in names,
     }
     return [(term, meaning) for term, meaning in READING if told.get(term, True)]
+
+
+def effort(numbers: Mapping[str, Any], colors: Mapping[str, str]) -> str:
+    """What the trials of each policy took; nothing where no policy in ``colors`` has such numbers."""
+    shown = (*tables.EFFORT, tables.DECISION)
+    body = ""
+    for name in tables.effort_of(numbers, list(colors)):
+        body += f'<tr class="mean">{page.named(name, colors[name])}'
+        for metric in shown:
+            key = f"{name}/{metric.key}"
+            body += page.cell(metric.show(numbers.get(key)), metric.show_interval(numbers.get(f"{key}_ci95")))
+        body += "</tr>"
+    return page.plain_table(["policy", *(metric.label for metric in shown)], body) if body else ""
 
 
 def broken(label: str) -> str:

@@ -32,7 +32,7 @@ from rich.table import Table
 from fb3d_rl.evaluation import learning, tables
 from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import Run, labels
-from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, SUCCESS, TRIAL, Means, Metric
+from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCESS, TRIAL, Means, Metric
 from fb3d_rl.files import write_text
 
 METHOD = (
@@ -129,6 +129,16 @@ class Entry:
         return _mean(learning.labels_used(log) for log in self.logs)
 
     @property
+    def decision_times(self) -> list[float | None]:
+        """Wall time of a decision, ms: the median of each of the first group's runs."""
+        return [run.summary.get(f"{self.policy}/{DECISION.key}") for run in self.groups[0].runs]
+
+    @property
+    def decision_ms(self) -> float | None:
+        """Wall time of a decision, ms, mean over seeds."""
+        return _mean(self.decision_times)
+
+    @property
     def expert_share(self) -> float | None:
         """Share of the collected steps in which the expert acted, mean over seeds."""
         return _mean(learning.expert_share(log) for log in self.logs)
@@ -177,7 +187,8 @@ def compare(runs: Sequence[Run]) -> Comparison:
     groups = _groups(runs)
     entries = _entries(groups)
     rows = [replace(row, policy=entry.label) for entry in entries for row in entry.rows.values()]
-    facts = {"policy": entries[0].label} if entries else {}
+    facts: dict[str, Any] = {"policy": entries[0].label} if entries else {}
+    facts |= {f"{entry.label}/{DECISION.key}": entry.decision_ms for entry in entries}
     return Comparison(groups, entries, _differences(entries), tables.summary(rows, [], facts))
 
 
@@ -324,9 +335,10 @@ def write_csv(comparison: Comparison, path: Path) -> None:
     """Write every number of the comparison as a tidy table with :data:`COLUMNS`.
 
     ``seed``, ``split`` and ``category`` are "all" or one of theirs. ``metric`` is a key of
-    :data:`fb3d_rl.evaluation.tables.TRIAL`, with "_class_mean" the mean over categories, with "_minus_<policy>"
-    the paired difference, or "labels" or "expert_share". ``low`` and ``high`` are the ends of the 95 % interval;
-    ``n`` counts trials.
+    :data:`fb3d_rl.evaluation.tables.TRIAL` or :data:`~fb3d_rl.evaluation.tables.EFFORT`, with "_class_mean" the mean
+    over categories, with "_minus_<policy>" the paired difference, or "labels", "expert_share" or the key of
+    :data:`~fb3d_rl.evaluation.tables.DECISION`. ``low`` and ``high`` are the ends of the 95 % interval; ``n`` counts
+    the trials that have a value.
     """
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
@@ -343,20 +355,22 @@ _CsvRow = tuple[object, ...]
 
 
 def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
-    seeds: list[tuple[str, list[TrialRow]]] = [("all", list(entry.rows.values()))]
+    everything = list(entry.rows.values())
+    seeds: list[tuple[str, list[TrialRow]]] = [("all", everything)]
     if len(entry.seeds) > 1:
         seeds += [(str(seed), entry.of_seed(seed)) for seed in entry.seeds]
+    metrics = TRIAL + tuple(metric for metric in EFFORT if tables.counted(everything, metric))
     for seed, of_seed in seeds:
         for split, of_split in _parts(of_seed, "split"):
             for category, rows in _parts(of_split, "category", single=True):
-                for metric in TRIAL:
+                for metric in metrics:
                     about = (entry.label, seed, split, category)
-                    counted = [row for row in rows if row.contact] if metric is tables.MOTION_ONLY else rows
-                    measured = tables.measure(rows, metric)
-                    yield from _means_rows(about, metric.key, "", measured, len(counted), classes=category == "all")
+                    n, measured = tables.counted(rows, metric), tables.measure(rows, metric)
+                    yield from _means_rows(about, metric.key, "", measured, n, classes=category == "all")
     for key, values, total in (
         ("labels", [learning.labels_used(log) for log in entry.logs], entry.labels),
         ("expert_share", [learning.expert_share(log) for log in entry.logs], entry.expert_share),
+        (DECISION.key, entry.decision_times, entry.decision_ms),
     ):
         if total is not None:
             yield (entry.label, "all", "all", "all", key, total, "", "", "")
@@ -468,6 +482,9 @@ def _tables(comparison: Comparison) -> Iterator[Table]:
             )
         if table.row_count:
             yield table
+    measured = tables.effort_of(comparison.numbers, [entry.label for entry in comparison.entries])
+    if measured:
+        yield tables.effort_table(comparison.numbers, measured)
     table = _table(
         "Differences on the same trials (success and contact in points)",
         ("policy", False), ("minus", False), ("n", True), ("success", True), ("95 %", True), ("contact", True),

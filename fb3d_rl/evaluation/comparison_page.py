@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 
 from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation import comparison, curves, failures, page, tables
-from fb3d_rl.evaluation.blocks import COPIED, FACTS, bars, broken, terms, write
+from fb3d_rl.evaluation.blocks import COPIED, FACTS, bars, broken, effort, terms, write
 from fb3d_rl.evaluation.comparison import Comparison, Group
 from fb3d_rl.evaluation.gallery import Shown, films, gallery
 from fb3d_rl.evaluation.page import text
@@ -42,6 +42,7 @@ def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = 
         + page.section("Results", _entry_table(found, colors), _split_entries(found, colors))
         + page.section("Side by side", _entry_bars(found, colors))
         + page.section("How trials ended", _ends(found))
+        + page.section("What it took", effort(found.numbers, colors))
         + page.section("Differences on the same trials", _difference_tables(found, colors))
         + page.section("Success by category", _entry_categories(found, colors))
         + page.section("Trials", _trials(found, colors))
@@ -71,10 +72,6 @@ def _left_out(unfinished: Sequence[Path]) -> str:
     return f'<p class="error">Left out, not finished (no summary.json): {text(names)}</p>'
 
 
-def _named(label: str, colors: Mapping[str, str]) -> str:
-    return f'<td class="text named">{page.swatch(colors[label])}{text(label)}</td>'
-
-
 def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> str:
     """A row per policy; of one split, or of all trials."""
     numbers = found.numbers["by_split"][split] if split else found.numbers
@@ -87,7 +84,7 @@ def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") 
     head += ["contact", "normalized distance"] + ["labels", "expert steps"] * labelled
     body = ""
     for entry in entries:
-        body += f'<tr class="mean">{_named(entry.label, colors)}'
+        body += f'<tr class="mean">{page.named(entry.label, colors[entry.label])}'
         body += page.cell(*comparison.cells(entry, numbers, SUCCESS))
         body += page.cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean"))
         if several:
@@ -144,7 +141,8 @@ def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
 def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:
     bodies: dict[str, str] = {}
     for three in comparison.by_pair(found):
-        row = f'<tr class="mean">{_named(three[0].entry.label, colors)}{page.cell(str(three[0].n))}'
+        label = three[0].entry.label
+        row = f'<tr class="mean">{page.named(label, colors[label])}{page.cell(str(three[0].n))}'
         row += "".join(page.cell(*comparison.show_difference(d.metric, d.means)) for d in three)
         bodies[three[0].baseline.label] = bodies.get(three[0].baseline.label, "") + row + "</tr>"
     head = ("policy", "trials", *(m.label + ", points" * m.percent for m in comparison.DIFFERENCES))

@@ -26,7 +26,7 @@ from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
-from fb3d_rl.evaluation.tables import show, summary
+from fb3d_rl.evaluation.tables import DECISION, show, summary
 from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
 from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.files import write_text
@@ -114,7 +114,7 @@ def evaluate(
             timing = _run(name, policy, shown, scheduled, protocol, done, keep)
             rows += [done[number] for number in sorted(done)]
             if timing:
-                numbers[f"{name}/time/decision_ms"] = 1000 * float(np.median(timing))
+                numbers[f"{name}/{DECISION.key}"] = 1000 * float(np.median(timing))
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())

@@ -87,6 +87,11 @@ def cell(value: str, small: str = "") -> str:
     return f"<td>{value}<small>{small}</small></td>"
 
 
+def named(name: str, shade: str) -> str:
+    """A cell with the name (plain text) and the colour of a policy or run."""
+    return f'<td class="text named">{swatch(shade)}{text(name)}</td>'
+
+
 def table(head: str, *bodies: str, scroll: bool = False) -> str:
     """A table that sorts by the column whose head is clicked.
 

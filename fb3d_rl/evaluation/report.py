@@ -9,7 +9,7 @@ from typing import Any
 import plotly.graph_objects as go
 
 from fb3d_rl.evaluation import clouds, curves, failures, page, tables
-from fb3d_rl.evaluation.blocks import COPIED, FACTS, bars, terms, write
+from fb3d_rl.evaluation.blocks import COPIED, FACTS, bars, effort, terms, write
 from fb3d_rl.evaluation.gallery import Shown, films, gallery
 from fb3d_rl.evaluation.page import text
 from fb3d_rl.evaluation.rows import TrialRow
@@ -41,6 +41,7 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
         + page.section("Results", _headline(numbers))
         + page.section("Success by category", _success_bars(numbers))
         + page.section("How trials ended", _ends(run.rows, policies, numbers.get("policy")))
+        + page.section("What it took", effort(numbers, colors))
         + page.section("Trials", _trials(run, colors))
         + page.section("True and predicted flow", clouds.viewer(run.clouds))
         + page.section("Numbers by category", _category_table(numbers), _split_table(numbers))

@@ -47,8 +47,9 @@ class Metric:
         key: its name in the summary.
         label: its name for people.
         short: the same in at most 7 characters, for the terminal's table.
-        percent: shown in percent, otherwise with two decimals.
+        percent: shown in percent, otherwise with ``decimals``.
         proportion: lies in [0, 1], so that Wilson's interval applies.
+        decimals: of a value that is not shown in percent.
     """
 
     key: str
@@ -56,18 +57,19 @@ class Metric:
     short: str
     percent: bool
     proportion: bool
+    decimals: int = 2
 
     def show(self, value: float | None) -> str:
         """``value`` for people; a dash where it is undefined."""
         if value is None:
             return "–"
-        return f"{100 * value:.0f} %" if self.percent else f"{value:.2f}"
+        return f"{100 * value:.0f} %" if self.percent else f"{value:.{self.decimals}f}"
 
     def show_interval(self, interval: Sequence[float] | None) -> str:
         """An interval as "lo–hi"; empty where there is none."""
         if interval is None:
             return ""
-        low, high = (f"{100 * x:.0f}" if self.percent else f"{x:.2f}" for x in interval)
+        low, high = (f"{100 * x:.0f}" if self.percent else f"{x:.{self.decimals}f}" for x in interval)
         return f"{low} to {high}" if "-" in low + high else f"{low}–{high}"
 
 
@@ -81,12 +83,16 @@ SUCCESS = Metric("success_rate", "success", "success", percent=True, proportion=
 MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, proportion=True)
 DISTANCE = Metric("normalized_distance", "normalized distance", "dist.", percent=False, proportion=True)
 TRIAL = (CONTACT, SUCCESS, MOTION_ONLY, DISTANCE)
-STEPS = Metric("steps_to_success", "steps to success", "steps", percent=False, proportion=False)
-SECONDS = Metric("seconds_to_success", "simulated seconds to success", "seconds", percent=False, proportion=False)
+STEPS = Metric("steps_to_success", "steps to success", "steps", percent=False, proportion=False, decimals=0)
+SECONDS = Metric(
+    "seconds_to_success", "simulated seconds to success", "seconds", percent=False, proportion=False, decimals=1
+)
 PATH = Metric("path_length", "way of the tip, m", "way", percent=False, proportion=False)
 LOST = Metric("times_lost", "times that hold was lost", "lost", percent=False, proportion=False)
 EFFORT = (STEPS, SECONDS, PATH, LOST)
 """What it took; of rows that were recorded before these numbers there are none."""
+DECISION = Metric("time/decision_ms", "wall time of a decision, ms", "ms", percent=False, proportion=False, decimals=1)
+"""Median over the decisions of a run, on the machine that it ran on; rows do not hold it."""
 
 _VALUES: dict[str, Callable[[Any], float | None]] = {
     "flow/cosine": lambda row: row.cosine,
@@ -177,6 +183,11 @@ def measure(rows: Iterable[TrialRow] | Iterable[FlowRow], metric: Metric) -> Mea
     """Means of ``metric`` over the objects of ``rows``, all rows of an object together."""
     value_of = _VALUES[metric.key]
     return means(_objects((row.category, row.object, value_of(row)) for row in rows), metric.proportion)
+
+
+def counted(rows: Iterable[TrialRow] | Iterable[FlowRow], metric: Metric) -> int:
+    """How many of ``rows`` have a value of ``metric``."""
+    return sum(_VALUES[metric.key](row) is not None for row in rows)
 
 
 def difference(pairs: Iterable[tuple[TrialRow, TrialRow]], metric: Metric) -> Means:
@@ -300,20 +311,42 @@ def has_flow(numbers: Mapping[str, Any]) -> bool:
     return "flow/n" in numbers
 
 
+def effort_of(numbers: Mapping[str, Any], names: Sequence[str]) -> list[str]:
+    """Those of the policies ``names`` of which a summary tells what their trials took."""
+    keys = [metric.key for metric in (*EFFORT, DECISION)]
+    return [name for name in names if any(numbers.get(f"{name}/{key}") is not None for key in keys)]
+
+
+def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
+    """What trials took, as a rich table with a row for each of the policies ``names``."""
+    table = Table(
+        title="What it took", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+    )
+    table.add_column("policy", overflow="fold")
+    for heading in ("steps to success", "seconds to success", "way of the tip, m", "times lost", "ms a decision"):
+        table.add_column(heading, justify="right")
+    for name in names:
+        table.add_row(name, *(m.show(numbers.get(f"{name}/{m.key}")) for m in (*EFFORT, DECISION)))
+    return table
+
+
 _POLICIES_PER_TABLE = 2
 
 
 def tables(numbers: Mapping[str, Any]) -> list[Table]:
     """A summary as rich tables of at most 100 columns: one row per category, then class and instance mean.
 
-    The flow and two policies fit side by side; further policies get tables of their own.
+    The flow and two policies fit side by side; further policies get tables of their own. The last says what the trials
+    took.
     """
     names = policies_of(numbers)
     chunks = [names[i : i + _POLICIES_PER_TABLE] for i in range(0, len(names), _POLICIES_PER_TABLE)]
     flow = has_flow(numbers)
     if not chunks and not flow:
         return []
-    return [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
+    found = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
+    measured = effort_of(numbers, names)
+    return [*found, effort_table(numbers, measured)] if measured else found
 
 
 def _table(numbers: Mapping[str, Any], names: Sequence[str], flow: bool) -> Table:

@@ -43,6 +43,7 @@ def trials(policy: str, seed: int, success: Outcome, parts: int = 1) -> list[Tri
                     trial=len(rows), policy=policy, object=object_, category=category, split=split,
                     link=f"link_{part}", semantic="door", joint_type="revolute", seed=1000 * seed + i, steps=40 + i,
                     contact=True, success=opened, normalized_distance=0.0 if opened else 1.0,
+                    seconds=(40 + i) / 20, path_length=1.5, lost=2,
                 )
             )  # fmt: skip
     return rows
@@ -61,6 +62,7 @@ def write_run(
     (folder / "config.yaml").write_text(json.dumps(config))
     write_trials(folder / "rows.csv", rows)
     facts = {"seed": seed, "policy": policy, "command": f"train {folder.name}", "git_revision": "cafe01"}
+    facts[f"{policy}/time/decision_ms"] = 10.5 + seed
     (folder / "summary.json").write_text(json.dumps(summary(rows, [], facts)))
     with RunLog(folder) as run_log:
         for row in log:
@@ -449,6 +451,14 @@ def test_the_page_tells_what_was_left_out_and_how_numbers_come_about(page: Page)
         assert words in shown, words
 
 
+def test_what_it_took_is_a_row_per_policy(found: Comparison, page: Page) -> None:
+    assert found.numbers["dagger/time/decision_ms"] == pytest.approx(11.5), "the mean over seeds"
+    assert found.numbers["expert/time/decision_ms"] is None, "no run is about it, and none told"
+    words = page.text[page.text.index("What it took", page.text.index("What it took") + 1) :]
+    row = words[words.index("dagger") :][:20]
+    assert {"1.50", "2.00", "11.5"} <= set(row), row
+
+
 def test_the_learning_curves_have_a_line_per_group(page: Page) -> None:
     figures = {id_: figure for id_, figure in page.figures.items() if id_.startswith("success-")}
     assert {figure["layout"]["xaxis"]["title"]["text"] for figure in figures.values()} == {"labels", "round"}
@@ -491,6 +501,10 @@ def test_the_csv_holds_every_number(found: Comparison, tmp_path: Path) -> None:
         categories = [value(label, "all", "all", f"Category{c}", "success_rate") for c in range(3)]
         assert math.fsum(categories) / 3 == pytest.approx(value(label, "all", "all", "all", "success_rate_class_mean"))
     assert value("dagger", "all", "all", "all", "success_rate_minus_bc") == pytest.approx(0.25)
+    assert value("dagger", "all", "all", "all", "times_lost") == 2
+    opened = [row for key, row in entry(found, "bc").rows.items() if row.success]
+    assert rows["bc", "all", "all", "all", "steps_to_success"]["n"] == str(len(opened)) != "36"
+    assert value("dagger", "2", "all", "all", "time/decision_ms") == 12.5
     assert value("dagger", "2", "all", "all", "labels") == 5060
     assert value("dagger", "all", "all", "all", "labels") == 5030
 

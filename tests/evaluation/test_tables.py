@@ -83,6 +83,28 @@ def test_a_crashed_trial_counts_as_a_failure() -> None:
         assert after[key] == pytest.approx((4 * before[key] + value) / 5)
 
 
+def test_what_it_took_counts_the_trials_that_it_is_about() -> None:
+    rows = [
+        trial("Oven", "a", True, steps=50, seconds=2.5, path_length=1.0, lost=0),
+        trial("Oven", "a", True, steps=70, seconds=3.5, path_length=2.0, lost=1),
+        trial("Oven", "b", False, steps=150, seconds=7.5, path_length=4.5, lost=4),
+    ]
+    numbers = summary(rows, [], {"artflownet/time/decision_ms": 12.34})
+    assert (numbers["steps_to_success"], numbers["seconds_to_success"]) == (60, 3.0), "only those that succeeded"
+    assert (numbers["path_length"], numbers["times_lost"]) == ((1.5 + 4.5) / 2, (0.5 + 4) / 2), "all of them"
+    with Console(width=100, record=True, file=io.StringIO()) as console:
+        show(numbers, console)
+    printed = console.export_text()
+    assert "What it took" in printed
+    assert printed.splitlines()[-1].split() == ["artflownet", "60", "3.0", "3.00", "2.25", "12.3"]
+
+    early = summary([trial("Oven", "a", False)], [])  # recorded before these numbers were
+    assert early["path_length"] is early["times_lost"] is early["seconds_to_success"] is None
+    with Console(width=100, record=True, file=io.StringIO()) as console:
+        show(early, console)
+    assert "What it took" not in console.export_text()
+
+
 def test_splits_are_told_apart() -> None:
     rows = [trial("Oven", "a", True), trial("Safe", "b", False, split="other")]
     by_split = summary(rows, [])["by_split"]
