@@ -1,11 +1,15 @@
 """Point operations on padded batches of clouds: sampling, neighbours, gathering, PCA curvature.
 
 Shapes: B clouds, N points each, M centres, K neighbours. ``valid`` is False on padding: a padding point is
-never sampled, grouped or interpolated from. All is plain PyTorch, runs on CPU and CUDA, and gives the same
-bits every time on a CPU.
+never sampled, grouped or interpolated from. All runs on CPU and CUDA in shapes that do not depend on the points, and
+gives the same bits every time on a CPU. It is plain PyTorch but for sampling on CUDA
+(:mod:`fb3d_rl.geometry.farthest_triton`).
 """
 
 from __future__ import annotations
+
+from functools import cache
+from importlib.util import find_spec
 
 import torch
 from torch import Tensor
@@ -14,6 +18,12 @@ from torch.nn import functional
 
 def _all_valid(points: Tensor, valid: Tensor | None) -> Tensor:
     return torch.ones(points.shape[:2], dtype=torch.bool, device=points.device) if valid is None else valid
+
+
+@cache
+def _has_triton() -> bool:
+    """PyTorch brings Triton along for CUDA on Linux only."""
+    return find_spec("triton") is not None
 
 
 def squared_distances(points: Tensor, others: Tensor) -> Tensor:
@@ -43,6 +53,11 @@ def farthest_point_sample(points: Tensor, count: int, valid: Tensor | None = Non
         Indices [B, count], int64. The first m of them are the answer to ``count=m``.
     """
     valid = _all_valid(points, valid)
+    if points.is_cuda and _has_triton():
+        from fb3d_rl.geometry import farthest_triton
+
+        if points.shape[1] <= farthest_triton.LARGEST:
+            return farthest_triton.farthest_point_sample(points, count, valid)
     coordinates = points.permute(2, 0, 1).contiguous()
     distance = torch.full(points.shape[:2], torch.inf, device=points.device, dtype=points.dtype)
     distance.masked_fill_(~valid, -1.0)
@@ -84,24 +99,19 @@ def ball_query(
     """
     valid = _all_valid(points, valid)
     batch, rows = centres.shape[:2]
-    inside = torch.empty(batch, rows, points.shape[1], dtype=torch.bool, device=points.device)
+    found = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
     # One cloud at a time on a CPU, so that its distances stay in the cache.
     size = 1 if points.device.type == "cpu" else batch
     for start in range(0, batch, size):
         part = slice(start, start + size)
-        torch.le(squared_distances(centres[part], points[part]), radius * radius, out=inside[part])
-        inside[part] &= valid[part, None]
-    inside = inside.view(batch * rows, -1)
-    degree = inside.sum(1)
-    owner, found = inside.nonzero(as_tuple=True)
-    rank = torch.arange(len(owner), device=owner.device) - (degree.cumsum(0) - degree)[owner]
-    kept = rank < count
-    owner, found, rank = owner[kept], found[kept], rank[kept]
-    index = torch.zeros(batch * rows, count, dtype=torch.int64, device=points.device)
-    index[owner, rank] = found
-    mask = torch.arange(count, device=points.device) < degree[:, None]
-    index = torch.where(mask, index, index[:, :1])
-    return index.view(batch, rows, count), mask.view(batch, rows, count)
+        inside = squared_distances(centres[part], points[part]) <= radius * radius
+        torch.cumsum(inside & valid[part, None], 2, dtype=torch.int32, out=found[part])
+    # The k-th neighbour is where the count of those found so far first reaches k.
+    rank = torch.arange(1, count + 1, dtype=torch.int32, device=points.device).repeat(batch, rows, 1)
+    mask = rank <= found[..., -1:]
+    index = torch.searchsorted(found, rank)
+    first = index[..., :1] * mask[..., :1]
+    return torch.where(mask, index, first), mask
 
 
 @torch.no_grad()

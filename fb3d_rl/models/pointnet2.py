@@ -39,19 +39,21 @@ class Level:
         valid: [B, N] bool.
         row: [B, N] the point's row among all valid points of the batch; on padding, of some other point.
         total: P, the number of valid points.
+        farthest: the points come in the order of farthest point sampling.
     """
 
     points: Tensor
     valid: Tensor
     row: Tensor
     total: int
+    farthest: bool = False
 
     @classmethod
     @eager
-    def of(cls, points: Tensor, valid: Tensor) -> Level:
+    def of(cls, points: Tensor, valid: Tensor, farthest: bool = False) -> Level:
         """Number the valid points."""
         row = valid.flatten().cumsum(0).view_as(valid)
-        return cls(points, valid, (row - 1).clamp_(min=0), int(row[-1, -1]))
+        return cls(points, valid, (row - 1).clamp_(min=0), int(row[-1, -1]), farthest)
 
     @eager
     def flat(self, values: Tensor) -> Tensor:
@@ -70,10 +72,12 @@ class Level:
     def coarser(self, ratio: float) -> Level:
         """Farthest points, ceil(ratio * number of valid points) of each cloud."""
         most = -int(-ratio * self.valid.shape[1] // 1)
-        chosen = ops.farthest_point_sample(self.points, most, self.valid)
+        if self.farthest:  # the first of them are what sampling them again would choose
+            points = self.points[:, :most]
+        else:
+            points = ops.gather(self.points, ops.farthest_point_sample(self.points, most, self.valid))
         count = torch.ceil(self.valid.sum(1, keepdim=True) * ratio)
-        keep = torch.arange(most, device=chosen.device) < count
-        return Level.of(ops.gather(self.points, chosen), keep)
+        return Level.of(points, torch.arange(most, device=points.device) < count, farthest=True)
 
     @eager
     @torch.no_grad()

@@ -34,6 +34,16 @@ def test_farthest_point_sample_of_few_points_repeats_valid_ones() -> None:
     assert chosen[2].tolist() == [0] * 6
 
 
+def test_what_was_sampled_first_is_what_sampling_again_would_choose() -> None:
+    """PointNet++ relies on it: a coarser level is the beginning of the level before."""
+    points, valid = make_clouds()
+    points[1, 20:] = points[1, 1]
+    points[2] = points[2].mul(4).round()  # a grid, where many distances are equal
+    once = ops.gather(points, ops.farthest_point_sample(points, 40, valid))
+    again = ops.gather(once, ops.farthest_point_sample(once, 15))
+    assert torch.equal(again, once[:, :15])
+
+
 def test_ball_query_keeps_the_first_valid_points_by_index() -> None:
     points, valid = make_clouds()
     centres = points[:, ::7]
