@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from fb3d_rl.evaluation.comparison import compare, write_csv
 from fb3d_rl.evaluation.published import paper
-from fb3d_rl.evaluation.runs import read_run
+from fb3d_rl.evaluation.runs import find_runs, read_run
 from fb3d_rl.evaluation.tables import summary
 from fb3d_rl.models.artflownet import PRETRAINED, ArtFlowNet
 
 RESULTS = Path(__file__).resolve().parents[2] / "results"
 RUNS = sorted(path.parent for path in RESULTS.glob("*/**/summary.json") if "runs" not in path.parts)
+
+FROM_LOGS = ("labels", "expert_share")
+"""Metrics that follow from logs, which results/ keeps of few runs."""
 
 
 def differing(computed: object, kept: object, where: str = "") -> list[str]:
@@ -36,6 +42,23 @@ def test_numbers_are_those_of_the_rows(folder: Path) -> None:
         assert {key: everything[key] for key in run.summary["flow_all_parts"]} == run.summary["flow_all_parts"]
     assert run.summary["command"].startswith("python launch/") and len(run.summary["git_revision"]) >= 7
     assert isinstance(run.seed, int)
+
+
+@pytest.mark.parametrize("table", sorted(RESULTS.glob("*/comparison.csv")), ids=lambda path: path.parent.name)
+def test_comparisons_are_those_of_the_rows(table: Path, tmp_path: Path) -> None:
+    write_csv(compare([read_run(run) for run in find_runs([table.parent])[0]]), tmp_path / "comparison.csv")
+    kept, computed = (
+        [entry_of(row) for row in csv.reader(path.open()) if row[4] not in FROM_LOGS]
+        for path in (table, tmp_path / "comparison.csv")
+    )
+    assert len(computed) == len(kept) > 1
+    for one, other in zip(computed, kept, strict=True):
+        assert one == other
+
+
+def entry_of(row: list[str]) -> list[object]:
+    """A line of a comparison; its numbers equal others to rounding."""
+    return [pytest.approx(float(cell), rel=1e-9) if re.fullmatch(r"-?[\d.]+(e-\d+)?", cell) else cell for cell in row]
 
 
 @pytest.mark.parametrize("page", sorted(RESULTS.glob("*/paper.md")), ids=lambda path: path.parent.name)

@@ -5,6 +5,7 @@ import math
 import os
 import signal
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from fb3d_rl.training.fit import (
     flow_loss,
     learning_rate,
     require_compiler,
+    resident,
     rotate_about_z,
 )
 
@@ -166,6 +168,19 @@ def test_ctrl_c_saves_after_a_whole_step_and_says_so() -> None:
             on_checkpoint=saved.append, progress=False)  # fmt: skip
     assert [state["step"] for state in saved] == [2]
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_rows_move_to_the_device_where_there_is_room(tmp_path: Path) -> None:
+    rows = make_rows(7)
+    buffer = ReplayBuffer(storage=LazyMemmapStorage(7, scratch_dir=tmp_path))
+    buffer.extend(rows)
+    size = 7 * rows[:1].bytes()
+    held = resident(buffer, "cpu", room=size, chunk=3)
+    assert held is not buffer and len(held) == 7
+    order = torch.tensor([6, 0, 3, 3])
+    assert same(held[order].to_dict(), rows[order].to_dict())
+    assert resident(buffer, "cpu", room=size - 1) is buffer
+    assert all(value.device.type == "meta" for value in resident(rows, "meta", room=size)[order].values(True, True))
 
 
 def test_every_pass_draws_every_row_once() -> None:
