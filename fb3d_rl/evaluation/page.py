@@ -18,7 +18,10 @@ from typing import Any
 import plotly.graph_objects as go
 from plotly.offline import get_plotlyjs
 
-PALETTE = ("#3b7dd8", "#e0782f", "#2f9e77", "#a45bd0", "#c9a227", "#d1495b", "#4fa3b5", "#7d8597")
+PALETTE = (
+    "#3b7dd8", "#e0782f", "#2f9e77", "#a45bd0", "#c9a227", "#d1495b", "#4fa3b5", "#7d8597", "#9c6b3f", "#d96fb0",
+    "#7aa43a", "#5b5fc7", "#c28f86", "#2aa8e0",
+)  # fmt: skip
 """Colours of policies and runs, readable on light and dark ground."""
 
 

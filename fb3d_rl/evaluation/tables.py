@@ -320,10 +320,14 @@ def effort_of(numbers: Mapping[str, Any], names: Sequence[str]) -> list[str]:
 def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
     """What trials took, as a rich table with a row for each of the policies ``names``."""
     table = Table(
-        title="What it took", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+        title="What it took, steps and seconds until success",
+        title_justify="left",
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        padding=(0, 1, 0, 0),
     )
     table.add_column("policy", overflow="fold")
-    for heading in ("steps to success", "seconds to success", "way of the tip, m", "times lost", "ms a decision"):
+    for heading in ("steps", "seconds", "way of the tip, m", "times lost", "ms a decision"):
         table.add_column(heading, justify="right")
     for name in names:
         table.add_row(name, *(m.show(numbers.get(f"{name}/{m.key}")) for m in (*EFFORT, DECISION)))
