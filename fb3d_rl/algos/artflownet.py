@@ -30,7 +30,7 @@ from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, fit, require_compiler
+from fb3d_rl.training.fit import FitOptions, emulates_bf16, fit, require_compiler
 from fb3d_rl.training.processes import rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
 
@@ -71,6 +71,10 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         setup.require_simulator()
     if options.compile:
         require_compiler(device)
+    if options.precision == "bf16" and emulates_bf16(device):
+        print(
+            "note: this processor has no AVX-512, without which algo.precision=bf16 is several times slower than fp32"
+        )
     samples = protocol.samples
     train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
     objects = setup.load(held_out)

@@ -189,6 +189,11 @@ def require_compiler(device: torch.device) -> None:
         ) from error
 
 
+def emulates_bf16(device: torch.device) -> bool:
+    """Whether ``device`` is a processor that lacks AVX-512, where products in bfloat16 take several times fp32's."""
+    return device.type == "cpu" and torch.backends.cpu.get_cpu_capability() in ("AVX2", "DEFAULT")
+
+
 def products_of(options: FitOptions, device: torch.device) -> torch.autocast:
     """The context in which a network's products are of the precision that the options say."""
     return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bf16")
