@@ -234,7 +234,7 @@ def _labels(names: Sequence[str], settings: Sequence[Mapping[str, str]], folders
         if len(peers) == 1:
             out.append(name)
         elif len(keys) > _MAX_KEYS or alike:
-            out.append(f"{name} · {folder}")
+            out.append(folder if folder.startswith(name) else f"{name} · {folder}")
         else:
             ends = Counter(map(_end, keys))
             short = ((_end(key) if ends[_end(key)] == 1 else key, own.get(key, "unset")) for key in keys)
