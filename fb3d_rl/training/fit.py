@@ -190,8 +190,8 @@ def require_compiler(device: torch.device) -> None:
 
 
 def emulates_bf16(device: torch.device) -> bool:
-    """Whether ``device`` is a processor that lacks AVX-512, where products in bfloat16 take several times fp32's."""
-    return device.type == "cpu" and torch.backends.cpu.get_cpu_capability() in ("AVX2", "DEFAULT")
+    """Whether ``device`` is an x86 processor without AVX-512, where bfloat16 products take several times fp32's."""
+    return device.type == "cpu" and torch.backends.cpu.get_cpu_capability() == "AVX2"
 
 
 def products_of(options: FitOptions, device: torch.device) -> torch.autocast:
