@@ -42,6 +42,7 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_clouds_that_a_policy_met_are_trained_on(tmp_path: Path, config: Config, weights: Path) -> None:
     settings = [*SMALL, f"data.met_by={weights}", "data.met_samples=8"]
     run(config("train", settings), tmp_path / "run")

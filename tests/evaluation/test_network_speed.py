@@ -17,6 +17,7 @@ def silent(text: str) -> None:
     assert text
 
 
+@pytest.mark.slow
 def test_every_contender_has_its_numbers(
     procedural_objects: dict[str, ArticulatedObject], monkeypatch: pytest.MonkeyPatch
 ) -> None:

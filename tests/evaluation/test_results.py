@@ -44,6 +44,7 @@ def test_numbers_are_those_of_the_rows(folder: Path) -> None:
     assert isinstance(run.seed, int)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("table", sorted(RESULTS.glob("*/comparison.csv")), ids=lambda path: path.parent.name)
 def test_comparisons_are_those_of_the_rows(table: Path, tmp_path: Path) -> None:
     write_csv(compare([read_run(run) for run in find_runs([table.parent])[0]]), tmp_path / "comparison.csv")

@@ -27,6 +27,7 @@ def test_objects_are_made_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert min(Image.open(sheet).size) > 100
 
 
+@pytest.mark.slow
 def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["generate", "--out", str(tmp_path), "--categories", "Phone,Switch", "--count", "1"]) == 0
     assert main(["validate", str(tmp_path), "--workers", "1"]) == 0

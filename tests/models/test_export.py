@@ -46,6 +46,7 @@ def test_fast_and_dense_network_are_equal(part_mask_input: bool, backbone: str) 
     torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), expected, atol=1e-10, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backbone", BACKBONES)
 def test_the_exported_program_equals_the_network(tmp_path: Path, backbone: str) -> None:
     net, path = trained(backbone=backbone), tmp_path / "net.pt2"
