@@ -64,7 +64,8 @@ class Link:
 class ArticulatedObject:
     """An object: its id, category, folder's URDF file and links (parents first).
 
-    ``dropped`` names what was left out while reading (degenerate meshes and the like), for reports.
+    ``dropped`` names what was left out while reading (degenerate meshes and the like), for reports; ``content`` is a
+    digest of the files that it was read from, "" for an object that was made in memory.
     """
 
     id: str
@@ -72,6 +73,7 @@ class ArticulatedObject:
     urdf: Path
     links: tuple[Link, ...]
     dropped: tuple[str, ...] = ()
+    content: str = ""
 
     @cached_property
     def movable(self) -> tuple[int, ...]:

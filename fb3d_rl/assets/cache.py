@@ -21,7 +21,7 @@ import numpy as np
 import platformdirs
 import trimesh
 
-from fb3d_rl.assets.articulation import Joint, Link, Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.files import write_bytes
 
 VERSION = 2
@@ -39,16 +39,27 @@ def cache_folder() -> Path:
     return Path(chosen) if chosen else platformdirs.user_cache_path("fb3d_rl")
 
 
-def cached(folder: Path, files: Iterable[Path], read: Callable[[], Parsed]) -> Parsed:
-    """What ``read`` returned when a folder's ``files`` had the content that they have now; it is called if need be.
+def digest_of(folder: Path, files: Iterable[Path]) -> str:
+    """SHA-256 of the names and contents of a folder's ``files``: the same wherever the folder lies."""
+    digest = hashlib.sha256()
+    for file in files:
+        content = file.read_bytes()
+        digest.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
+        digest.update(content)
+    return digest.hexdigest()
+
+
+def content_digest(obj: ArticulatedObject) -> str:
+    """What an object is made of, as a digest: of its files, or of its links where it was made in memory."""
+    return obj.content or hashlib.sha256(_pack((obj.links, ()))).hexdigest()
+
+
+def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
+    """What ``read`` returned for files of this content (:func:`digest_of`); it is called if need be.
 
     Where entries cannot be written, objects are read anew each time.
     """
-    key = hashlib.sha256(f"{VERSION} {trimesh.__version__}".encode())
-    for file in files:
-        content = file.read_bytes()
-        key.update(f"\0{file.relative_to(folder).as_posix()}\0{len(content)}\0".encode("utf-8", "surrogateescape"))
-        key.update(content)
+    key = hashlib.sha256(f"{VERSION} {trimesh.__version__} {digest}".encode())
     entry = cache_folder() / f"objects/{key.hexdigest()}"
     with suppress(OSError):
         stored = memoryview(entry.read_bytes())

@@ -23,7 +23,7 @@ from rich.progress import track
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Link, Mesh
-from fb3d_rl.assets.cache import Parsed, cached
+from fb3d_rl.assets.cache import Parsed, cached, digest_of
 from fb3d_rl.assets.folders import URDFS, find_urdf
 from fb3d_rl.assets.splits import CATEGORIES
 from fb3d_rl.contract import UserError
@@ -62,19 +62,34 @@ def load_object(folder: str | Path) -> ArticulatedObject:
         UserError: the folder, the URDF or a mesh is missing or broken; the message names it.
     """
     folder = Path(folder)
+    urdf = _urdf_of(folder)
+    try:
+        category = read_category(folder)
+        content = digest_of(folder, _sources(folder, urdf))
+        links, dropped = cached(content, _Reader(folder, urdf).read)
+        return ArticulatedObject(folder.name, category, urdf, links, dropped, content)
+    except (ParseError, DefusedXmlException) as error:
+        raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
+    except OSError as error:
+        raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
+
+
+def content_of(folder: Path) -> str:
+    """The digest of what an object is read from (:attr:`~ArticulatedObject.content`), without reading its meshes.
+
+    Raises:
+        UserError: the folder holds no object, or one that is too large.
+    """
+    return digest_of(folder, _sources(folder, _urdf_of(folder)))
+
+
+def _urdf_of(folder: Path) -> Path:
     urdf = find_urdf(folder)
     if urdf is None:
         raise UserError(
             f"object {folder.name}: {folder / URDFS[-1]} does not exist, so the folder is no PartNet-Mobility object"
         )
-    try:
-        category = read_category(folder)
-        links, dropped = cached(folder, _sources(folder, urdf), _Reader(folder, urdf).read)
-        return ArticulatedObject(folder.name, category, urdf, links, dropped)
-    except (ParseError, DefusedXmlException) as error:
-        raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
-    except OSError as error:
-        raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
+    return urdf
 
 
 def read_category(folder: Path) -> str:

@@ -5,8 +5,11 @@ Definitions
     if its rows are equal, and starts a group of its own if they are not.
     An *entry* is one row of the comparison: a policy with its trials of all seeds. The policy that a run is about
     is an entry of its group. Other policies of a run (the expert, a given ArtFlowNet) are repeated by many runs:
-    they are one entry with those of another group if both have trials in common (same seed, object, part and
-    view) and every one of these ended alike; what ended otherwise stands apart under the name of its group.
+    they are one entry with those of another group if both have trials in common and every one of these ended alike;
+    what ended otherwise stands apart under the name of its group.
+    Two rows are of the same *trial* if their keys are equal, which tell the object's content, part, start, goal, view
+    and what suction may hold (:func:`fb3d_rl.evaluation.trials.trial_key`). Rows of earlier versions have no key: they
+    are of the same trial if object, part and seeds are the same and the runs' settings of all that a key tells are.
 
 Intervals
     As in :mod:`fb3d_rl.evaluation.tables`: objects are resampled, and all trials of an object, those of all seeds,
@@ -42,9 +45,9 @@ METHOD = (
     ("Range over seeds", "the lowest and the highest seed's instance mean."),
     ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
      "a policy whose repeats differ stands in several rows."),
-    ("Difference", "between two policies on the trials that both ran (same seed, object, part and view), trial by "
-     "trial, as a mean over objects; its interval resamples objects likewise. There is none if all objects differ "
-     "by the same."),
+    ("Difference", "between two policies on the trials that both ran (same object, part, start, goal, view and "
+     "suction), trial by trial, as a mean over objects; its interval resamples objects likewise. There is none if all "
+     "objects differ by the same."),
     ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
      "those steps in which the expert also acted."),
 )  # fmt: skip
@@ -62,8 +65,13 @@ _NOT_COMPARED = ("seed", "resume")
 _MAX_KEYS = 3
 """Settings in a label; runs that differ in more are told apart by their folders."""
 
-TrialKey = tuple[int | None, str, str, str, str, int, int]
-"""Run seed, split, category, object, link, trial seed, and the how manyth of these."""
+TrialKey = tuple[int | None, str, int]
+"""Run seed, the trial's key, and a count of the rows that have the same before this one."""
+
+_DECIDE_TRIALS = ("assets.", "camera.", "data.points", "evaluation.start", "evaluation.goal", "env.suction.hold")
+"""Settings that decide what a trial is, beside its seed."""
+_WHICH_TRIALS = ("assets.split", "assets.eval_split", "assets.root", "assets.split_file", "assets.train_count")
+"""Of these, settings that only choose among trials."""
 
 
 @dataclass(frozen=True)
@@ -276,13 +284,24 @@ def _entries(groups: Sequence[Group]) -> list[Entry]:
 def _keyed(group: Group, policy: str) -> dict[TrialKey, TrialRow]:
     keyed: dict[TrialKey, TrialRow] = {}
     for run in group.runs:
-        times: Counter[tuple[str, str, str, str, int]] = Counter()
+        times: Counter[str] = Counter()
         for row in run.rows:
             if row.policy == policy:
-                what = (row.split, row.category, row.object, row.link, row.seed)
-                keyed[(run.seed, *what, times[what])] = row
-                times[what] += 1
+                key = row.key or _key_without(row, run)
+                keyed[(run.seed, key, times[key])] = row
+                times[key] += 1
     return keyed
+
+
+def _key_without(row: TrialRow, run: Run) -> str:
+    """The trial of a row that was written without a key, by the run's settings; its own where these are not known."""
+    decisive = {
+        key: value
+        for key, value in run.settings.items()
+        if key.startswith(_DECIDE_TRIALS) and not key.startswith(_WHICH_TRIALS)
+    }
+    settings = sorted(decisive.items()) if decisive else str(run.path)
+    return str((row.split, row.category, row.object, row.link, row.seed, row.repeat, settings))
 
 
 def _repeats(rows: Mapping[TrialKey, TrialRow], others: Mapping[TrialKey, TrialRow]) -> bool:

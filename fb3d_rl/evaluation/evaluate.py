@@ -27,10 +27,12 @@ from fb3d_rl.evaluation.report import write_report
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
 from fb3d_rl.evaluation.tables import DECISION, show, summary
-from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
+from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule, trial_key
 from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.files import write_text
 from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.policies.digest import policy_digest
+from fb3d_rl.training.run_log import read_rows
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class Protocol:
         seed: base seed of trials and samples.
         schedule: starts, goals and repetitions of the trials.
         decision_seconds: time limit of a decision, s; None for none.
-        resume: go on from the rows that the run folder holds.
+        resume: go on from the rows that the run folder holds, those of the same trials and policies.
     """
 
     samples: SampleOptions
@@ -89,7 +91,7 @@ def evaluate(
         One row for each scheduled trial and policy.
 
     Raises:
-        UserError: it is to go on from rows of other trials.
+        UserError: it is to go on from rows of other trials or policies.
     """
     numbers: dict[str, Any] = dict(facts)
     measured: list[FlowRow] = []
@@ -104,17 +106,21 @@ def evaluate(
         )
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
-    before = read_trials(out / "rows.csv") if protocol.resume and (out / "rows.csv").is_file() else []
+    named = {obj.id: obj for obj in shown}
+    keys = [trial_key(named[item.trial.object], item.trial, protocol.env.suction.hold) for item in scheduled]
+    found = _rows_before(out / "rows.csv", policies, keys) if protocol.resume and scheduled else {}
+    times = DecisionTimes(out, [row for done in found.values() for row in done.values()])
     rows: list[TrialRow] = []
     with progress_bars() as bar:
         for name, policy in policies.items() if scheduled else ():
-            done = _done(name, before, scheduled)
+            done = found.get(name, {})
             task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
             keep = partial(_keep, out / "rows.csv", rows, done, partial(bar.advance, task))
-            timing = _run(name, policy, shown, scheduled, protocol, done, keep)
+            _run(name, policy, shown, scheduled, protocol, done, keep, times)
             rows += [done[number] for number in sorted(done)]
-            if timing:
-                numbers[f"{name}/{DECISION.key}"] = 1000 * float(np.median(timing))
+            median = times.median(name)
+            if median is not None:
+                numbers[f"{name}/{DECISION.key}"] = 1000 * median
     numbers = summary(rows, measured, numbers)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())
@@ -139,21 +145,62 @@ def progress_bars() -> Progress:
     return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 
-def _done(policy: str, rows: Sequence[TrialRow], scheduled: Sequence[Scheduled]) -> dict[int, TrialRow]:
-    """The trials that a policy has run already, by their numbers.
+def _rows_before(
+    path: Path, policies: Mapping[str, TensorDictModuleBase], keys: Sequence[str]
+) -> dict[str, dict[int, TrialRow]]:
+    """The trials that each policy has run already, by their numbers: rows of the same trial and the same policy.
 
     Raises:
-        UserError: a row is of another trial than is scheduled under its number.
+        UserError: a row is of another trial than is scheduled under its number, or of another policy.
     """
-    done = {row.trial: row for row in rows if row.policy == policy}
-    for number, row in done.items():
-        item = scheduled[number] if number < len(scheduled) else None
-        if item is None or (row.object, row.link, row.seed) != (item.trial.object, item.link, item.trial.seed):
+    found: dict[str, dict[int, TrialRow]] = {name: {} for name in policies}
+    digests = {name: policy_digest(policy) for name, policy in policies.items()}
+    for row in read_trials(path) if path.is_file() else []:
+        of_row = f"{row.policy} with {row.category} {row.object}"
+        mend = "evaluate in another folder: hydra.run.dir=DIR"
+        if row.trial >= len(keys) or row.key != keys[row.trial]:
+            raise UserError(f"{path} holds trial {row.trial}, {of_row}, which is not the one that is scheduled; {mend}")
+        if row.policy_digest != digests.get(row.policy):
             raise UserError(
-                f"rows.csv holds a trial of {row.category} {row.object} under number {number}, which is not scheduled; "
-                "resume with the settings it was started with, or choose another folder: hydra.run.dir=DIR"
+                f"{path} holds a trial of {of_row}, run by other weights or options than this evaluation has; {mend}"
             )
-    return done
+        found[row.policy][row.trial] = row
+    return found
+
+
+class DecisionTimes:
+    """How long decisions took in wall time, for each trial, kept beside the rows: they differ between two runs.
+
+    Args:
+        out: the run folder.
+        rows: whose times are taken over from there.
+    """
+
+    FILE = "decision_times.jsonl"
+
+    def __init__(self, out: Path, rows: Sequence[TrialRow] = ()) -> None:
+        self._path = out / self.FILE
+        known = {(row.policy, row.trial) for row in rows}
+        lines = read_rows(self._path) if known and self._path.is_file() else []
+        kept = [line for line in lines if (line["policy"], line["trial"]) in known]
+        self._times: dict[str, list[float]] = {}
+        for line in kept:
+            self._times.setdefault(line["policy"], []).extend(line["seconds"])
+        if kept or self._path.is_file():
+            write_text(self._path, "".join(json.dumps(line) + "\n" for line in kept))
+
+    def add(self, policy: str, trial: int, seconds: Sequence[float]) -> None:
+        """Take the times [T] (s) of a trial."""
+        rounded = [round(value, 6) for value in seconds]
+        line = {"policy": policy, "trial": trial, "seconds": rounded}
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+        self._times.setdefault(policy, []).extend(rounded)
+
+    def median(self, policy: str) -> float | None:
+        """Median (s) over the decisions of all trials of a policy; None without any."""
+        times = self._times.get(policy)
+        return float(np.median(times)) if times else None
 
 
 def _run(
@@ -164,15 +211,15 @@ def _run(
     protocol: Protocol,
     done: Mapping[int, TrialRow],
     keep: Callable[[TrialRow], None],
-) -> list[float]:
-    """Run the trials that are not done; each row goes to ``keep``. Returns the seconds that each decision took."""
+    times: DecisionTimes,
+) -> None:
+    """Run the trials that are not done; each row goes to ``keep``, and what its decisions took to ``times``."""
     left = [number for number in range(len(scheduled)) if number not in done]
-    timing: list[float] = []
     run_trials(
         name, policy, objects, [scheduled[number] for number in left], protocol.env,
-        lambda row: keep(replace(row, trial=left[row.trial])), protocol.collector, protocol.decision_seconds, timing,
+        lambda row: keep(replace(row, trial=left[row.trial])), protocol.collector, protocol.decision_seconds,
+        lambda number, seconds: times.add(name, left[number], seconds),
     )  # fmt: skip
-    return timing
 
 
 def _keep(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +30,8 @@ from fb3d_rl.evaluation.rows import (
     WRONG_WAY,
     TrialRow,
 )
-from fb3d_rl.evaluation.trials import Scheduled
+from fb3d_rl.evaluation.trials import Scheduled, trial_key
+from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicy
 
 KEYS: tuple[Key, ...] = (
@@ -100,7 +102,7 @@ def run_trials(
     progress: Callable[[TrialRow], None] = lambda row: None,
     collector: CollectorOptions | None = None,
     limit: float | None = None,
-    timing: list[float] | None = None,
+    timing: Callable[[int, list[float]], None] = lambda trial, seconds: None,
 ) -> list[TrialRow]:
     """Run every trial once.
 
@@ -116,7 +118,8 @@ def run_trials(
         progress: called with each row.
         collector: where the trials run; in this process unless given.
         limit: seconds that a decision may take (:class:`~fb3d_rl.evaluation.decisions.TimedPolicy`); None for no limit.
-        timing: takes the seconds that each decision took, in any order.
+        timing: called with the place of each trial that did not crash and the wall time of its decisions [T], s,
+            before its row goes to ``progress``.
 
     Returns:
         One row per trial, in the order of ``scheduled``.
@@ -124,11 +127,17 @@ def run_trials(
     rows: dict[int, TrialRow] = {}
     create = partial(create_env, tuple(objects), options, state_of(policy))
     timed = TimedPolicy(policy, limit)
+    named, acting = {obj.id: obj for obj in objects}, policy_digest(policy)
     with Workers(create, timed, collector or CollectorOptions(), options.horizon) as workers:
         for episode in workers.run([item.trial for item in scheduled], KEYS):
-            row = _row(episode, name, scheduled[episode.index], options)
-            if timing is not None and episode.frames is not None:
-                timing += episode.frames[DECISION].flatten().tolist()
+            item = scheduled[episode.index]
+            row = replace(
+                _row(episode, name, item, options),
+                key=trial_key(named[item.trial.object], item.trial, options.suction.hold),
+                policy_digest=acting,
+            )
+            if episode.frames is not None:
+                timing(episode.index, episode.frames[DECISION].flatten().tolist())
             rows[episode.index] = row
             progress(row)
     return [rows[i] for i in range(len(scheduled))]

@@ -62,6 +62,8 @@ class TrialRow:
         seconds: simulated time until success, else until the end, s; -1 if it was not recorded.
         path_length: way of the suction tip, m; -1 if it was not recorded.
         lost: how often the part was held and then was not; -1 if it was not recorded.
+        key: what the trial is (:func:`fb3d_rl.evaluation.trials.trial_key`); "" if it was not recorded.
+        policy_digest: what the policy is (:func:`fb3d_rl.policies.digest.policy_digest`); "" if it was not recorded.
 
     Raises:
         ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success
@@ -89,6 +91,8 @@ class TrialRow:
     seconds: float = -1.0
     path_length: float = -1.0
     lost: int = -1
+    key: str = ""
+    policy_digest: str = ""
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Literal
 
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.cache import content_digest
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Start, Trial, default_trial, drawn_fraction
@@ -28,6 +31,18 @@ class Scheduled:
     semantic: str
     joint_type: str
     repeat: int = 0
+
+
+def trial_key(obj: ArticulatedObject, trial: Trial, hold: str) -> str:
+    """What a trial is, as a digest (16 hexadecimal digits): two rows with the same key ran the same trial.
+
+    Args:
+        obj: the trial's object, of which the id and the content count.
+        trial: the trial.
+        hold: what suction may hold (:class:`~fb3d_rl.env.options.SuctionOptions`).
+    """
+    whole = [obj.id, content_digest(obj), *astuple(trial), hold]  # astuple: every field, those to come as well
+    return hashlib.sha256(json.dumps(whole).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import math
 import re
 import runpy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ def trials(policy: str, seed: int, success: Outcome, parts: int = 1) -> list[Tri
                     trial=len(rows), policy=policy, object=object_, category=category, split=split,
                     link=f"link_{part}", semantic="door", joint_type="revolute", seed=1000 * seed + i, steps=40 + i,
                     contact=True, success=opened, normalized_distance=0.0 if opened else 1.0,
-                    seconds=(40 + i) / 20, path_length=1.5, lost=2,
+                    seconds=(40 + i) / 20, path_length=1.5, lost=2, key=f"{object_}-{part}-{seed}",
                 )
             )  # fmt: skip
     return rows
@@ -278,6 +279,37 @@ def pairs_of(one: Sequence[bool], two: Sequence[bool]) -> list[tuple[TrialRow, T
     a = trials("a", 0, lambda _, __, i: one[i])
     b = trials("b", 0, lambda _, __, i: two[i])
     return list(zip(a, b, strict=True))
+
+
+def test_rows_are_paired_by_what_their_trials_are(tmp_path: Path) -> None:
+    """The same object, part and seed seen from elsewhere, or started otherwise, is another trial."""
+    write_run(tmp_path / "expert", "expert", 0, trials("expert", 0, skill))
+    elsewhere = [replace(row, key=f"other {row.key}") for row in trials("bc", 0, skill)]
+    write_run(tmp_path / "bc", "bc", 0, [*trials("bc", 0, skill)[:5], *elsewhere[5:]])
+    (success, *_) = [d for d in compared(tmp_path).differences if d.metric is SUCCESS]
+    assert success.n == 5
+
+
+@pytest.mark.parametrize(
+    ("mine", "other", "pairs"),
+    [
+        ({"camera": {"fov": 40.0}}, {"camera": {"fov": 40.0}}, len(OBJECTS)),
+        ({"camera": {"azimuth": [-45, 45]}}, {"camera": {"azimuth": [-30, -30]}}, 0),
+        ({"evaluation": {"start": "reference"}}, {"evaluation": {"start": "closed"}}, 0),
+        ({"env": {"suction": {"hold": "any"}}}, {"env": {"suction": {"hold": "target"}}}, 0),
+        ({"assets": {"split": "all"}, "data": {"points": 9}}, {"assets": {"split": "x"}, "data": {"points": 9}},
+         len(OBJECTS)),
+        ({}, {}, 0),  # nobody knows
+    ],
+)  # fmt: skip
+def test_rows_without_keys_are_paired_where_the_settings_of_trials_agree(
+    tmp_path: Path, mine: dict[str, Any], other: dict[str, Any], pairs: int
+) -> None:
+    for name, settings in (("expert", mine), ("bc", other)):
+        rows = [replace(row, key="") for row in trials(name, 0, skill)]
+        folder = write_run(tmp_path / name, name, 0, rows)
+        (folder / "config.yaml").write_text(json.dumps({"seed": 0, "policy": {"name": name}, **settings}))
+    assert [d.n for d in compared(tmp_path).differences if d.metric is SUCCESS] == [pairs] * (pairs > 0)
 
 
 def test_differences_by_hand(found: Comparison) -> None:

@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,7 @@ from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.rollout import _outcome, run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 
@@ -124,6 +126,8 @@ def test_worker_processes_give_the_same_rows_and_a_dead_one_costs_its_trial_only
                        CollectorOptions("process", 2))  # fmt: skip
     assert sorted(seen) == list(range(len(trials)))
     assert again[1].status == "error" and "signal 9" in again[1].error and again[1].failure == "crashed"
+    assert policy_digest(policy) != policy_digest(expert_policy(LIMITS))  # it is another policy
+    again = [replace(row, policy_digest=rows[0].policy_digest) for row in again]
     assert again[:1] + again[2:] == rows[:1] + rows[2:]
 
 
@@ -147,7 +151,8 @@ def test_a_policy_that_hangs_costs_its_own_trial(
     started = time.perf_counter()
     timing: list[float] = []
     rows = run_trials("late", Policy(Late(60.0, first=8)), objects, trials[:4], options,
-                      collector=CollectorOptions(backend, 1), limit=0.5, timing=timing)  # fmt: skip
+                      collector=CollectorOptions(backend, 1), limit=0.5,
+                      timing=lambda trial, seconds: timing.extend(seconds))  # fmt: skip
     assert time.perf_counter() - started < 50
     assert [row.status for row in rows] == ["ok", "ok", "error", "error"]
     assert {row.failure for row in rows[2:]} == {"took too long"} and "0.5 s" in rows[2].error

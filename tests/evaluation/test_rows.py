@@ -81,11 +81,12 @@ def test_other_columns_are_refused(tmp_path: Path) -> None:
 
 def test_files_of_earlier_versions_lack_what_came_later(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
-    write_trials(path, [trial(contact=True, repeat=2, seconds=7.5, path_length=1.25, lost=1)])
+    write_trials(path, [trial(contact=True, repeat=2, seconds=7.5, path_length=1.25, lost=1, key="ab")])
     assert read_trials(path)[0].path_length == 1.25
     rows = list(csv.reader(path.read_text().splitlines()))
-    path.write_text("".join(",".join(row[:-4]) + "\n" for row in rows))
-    assert read_trials(path) == [trial(contact=True)]
+    came_later = rows[0].index("repeat") + 1
+    path.write_text("".join(",".join(row[:came_later]) + "\n" for row in rows))
+    assert read_trials(path) == [trial(contact=True, repeat=2)]
     path.write_text("".join(",".join(row[1:]) + "\n" for row in rows))
     with pytest.raises(UserError, match="columns"):
         read_trials(path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
-from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule
+from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule, trial_key
 from fb3d_rl.flow.opening import openable_links, opening_range
 
 OPTIONS = SampleOptions(points=300, camera=CameraOptions(resolution=48))
@@ -44,6 +46,26 @@ def test_a_trial_depends_on_the_seed_and_its_object_alone(objects: list[tuple[Ar
     alone, _ = schedule(objects[:1], OPTIONS, seed=0)
     assert alone == [item for item in everything if item.trial.object == objects[0][0].id]
     assert [t.trial.view for t in schedule(objects, OPTIONS, seed=1)[0]] != [t.trial.view for t in everything]
+
+
+def test_a_key_tells_all_that_a_trial_is(objects: list[tuple[ArticulatedObject, str]], tmp_path: Path) -> None:
+    """Two rows of one key ran the same trial, wherever the object's folder lay; anything else gives another key."""
+    obj = objects[0][0]
+    trial = schedule(objects[:1], OPTIONS, seed=0)[0][0].trial
+    key = trial_key(obj, trial, "target")
+    moved = shutil.copytree(obj.urdf.parent, tmp_path / obj.id)
+    assert trial_key(load_object(moved), replace(trial), "target") == key
+    view = replace(trial.view, azimuth=trial.view.azimuth + 1e-9)
+    start = (trial.start[0] + 1e-12, *trial.start[1:])
+    others = [{"view": view}, {"start": start}, {"goal": 0.5}, {"seed": trial.seed + 1}, {"link": trial.link + 1}]
+    keys = {
+        trial_key(obj, replace(trial, **{name: value}), "target") for other in others for name, value in other.items()
+    }
+    semantics = moved / "semantics.txt"
+    semantics.write_text(semantics.read_text() + "\n")
+    keys |= {trial_key(obj, trial, "any"), trial_key(load_object(moved), trial, "target")}
+    keys |= {trial_key(replace(obj, content=""), trial, "target")}  # made in memory: its links count
+    assert len(keys | {key}) == len(others) + 4
 
 
 def test_a_limit_takes_the_categories_in_turn(objects: list[tuple[ArticulatedObject, str]]) -> None:
