@@ -368,6 +368,21 @@ class EvaluateConfig(CommandConfig):
     resume: bool
 
 
+RUN_FILES = frozenset(
+    {
+        "config.yaml", "metrics.jsonl", "checkpoint.pt", "best.safetensors", "rows.csv", "decision_times.jsonl",
+        "flow_rows.csv", "flow_rows_all_parts.csv", "summary.json", "report.html", "clouds.npz", "flow.png", "videos",
+        "samples", "met", "buffer", "objects",
+    }
+)  # fmt: skip
+"""What a run leaves in its folder; a new run wants a folder without any of it."""
+
+
+def changes_no_number(key: str) -> bool:
+    """Whether a run may go on with another value of this dotted key: where it computes, and where its log goes."""
+    return key in ("device", "data.workers") or key.startswith(("collector.", "logger."))
+
+
 UNTRAINED = ("expert", "random", "normal")
 """Policies that need no checkpoint."""
 

@@ -14,6 +14,7 @@ os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors come here as exceptions
 os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells about every memory map
 
 import hydra
+import run_folder
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
@@ -40,6 +41,7 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
 
     Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend.
     """
+    schemas = {**SCHEMAS, **{f"algo/{kind}": node for kind, node in ALGOS.items()}}
     ConfigStore.instance().store(name=f"{name}_schema", node=SCHEMAS[name])
     for kind, node in ALGOS.items():
         ConfigStore.instance().store(group="algo", name=f"{kind}_schema", node=node)
@@ -47,17 +49,21 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:
         out = Path(HydraConfig.get().runtime.output_dir)
-        fresh = keeps and not any(out.iterdir())
         with _one_sentence():
-            try:
+            if not keeps:
                 cfg: Any = OmegaConf.to_object(raw)
                 validate(cfg)
-                if keeps and not getattr(cfg, "resume", False):  # a resumed run keeps its own
-                    OmegaConf.save(raw, out / "config.yaml")
                 task(cfg, out)
+                return
+            fresh = run_folder.is_new(out)
+            try:
+                with run_folder.locked(out):
+                    cfg = OmegaConf.to_object(run_folder.configuration(raw, name, out, schemas))
+                    validate(cfg)
+                    task(cfg, out)
             except UserError:
                 # A run that never began leaves no folder.
-                if fresh and {path.name for path in out.iterdir()} <= {"config.yaml"}:
+                if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
                     shutil.rmtree(out)
                 raise
 

@@ -6,12 +6,11 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 
 from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
 from fb3d_rl.contract import UserError
@@ -129,8 +128,10 @@ def test_an_interrupted_evaluation_goes_on_from_its_rows(
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     expected = run_evaluation(config("evaluate", words), whole)
     cut.mkdir()
-    (cut / "config.yaml").write_text(yaml.safe_dump(asdict(config("evaluate", words))))
     write_trials(cut / "rows.csv", [expected[0], expected[1], expected[3]])
+    times = (whole / "decision_times.jsonl").read_text().splitlines(keepends=True)
+    slow = [json.dumps({**json.loads(line), "seconds": [5.0] * 70}) + "\n" for line in times]
+    (cut / "decision_times.jsonl").write_text("".join(slow))
     ran: list[int] = []
     run_all = evaluation.run_trials
 
@@ -142,11 +143,22 @@ def test_an_interrupted_evaluation_goes_on_from_its_rows(
     assert run_evaluation(config("evaluate", [*words, "resume=true"]), cut) == expected
     assert ran == [0, 1]
     assert (cut / "rows.csv").read_bytes() == (whole / "rows.csv").read_bytes()
-    with pytest.raises(UserError, match=r"begun with env\.success=0\.1, not 0\.2"):
-        run_evaluation(config("evaluate", [*words, "resume=true", "env.success=0.2"]), cut)
-    write_trials(cut / "rows.csv", [replace(expected[0], trial=1)])
-    with pytest.raises(UserError, match="under number 1, which is not scheduled"):
-        run_evaluation(config("evaluate", [*words, "resume=true"]), cut)
+    # The median is that of all trials: of artflownet's two, one is kept with its time.
+    assert json.loads((cut / "summary.json").read_text())["expert/time/decision_ms"] == 5000.0
+    kept = [json.loads(line) for line in (cut / "decision_times.jsonl").read_text().splitlines()]
+    assert [(line["policy"], line["trial"], line["seconds"][0] == 5.0) for line in kept] == [
+        ("expert", 0, True), ("expert", 1, True), ("artflownet", 1, True), ("artflownet", 0, False)
+    ]  # fmt: skip
+    for foreign, said in (
+        (replace(expected[0], trial=1), "trial 1, expert with .* not the one that is scheduled"),
+        (replace(expected[0], key="another view"), "not the one that is scheduled"),
+        (replace(expected[2], policy_digest="another network"), "other weights or options"),
+        (replace(expected[2], policy="bc"), "other weights or options"),
+    ):
+        write_trials(cut / "rows.csv", [foreign])
+        with pytest.raises(UserError, match=said):
+            run_evaluation(config("evaluate", [*words, "resume=true"]), cut)
+        assert read_trials(cut / "rows.csv") == [foreign]
 
 
 @pytest.mark.slow

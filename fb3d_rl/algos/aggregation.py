@@ -18,6 +18,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.cache import content_digest
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.generate import empty_rows, finish, finished_rows
 from fb3d_rl.data.samples import ObjectView
@@ -61,8 +62,8 @@ def meet_samples(
     Raises:
         UserError: all trials of a batch crashed, or showed nothing that moves.
     """
-    recipe = {"objects": [obj.id for obj in objects], "count": count, "seed": protocol.seed, "made_by": made_by,
-              "samples": asdict(protocol.samples), "env": asdict(protocol.env)}  # fmt: skip
+    recipe = {"objects": [[obj.id, content_digest(obj)] for obj in objects], "count": count, "seed": protocol.seed,
+              "made_by": made_by, "samples": asdict(protocol.samples), "env": asdict(protocol.env)}  # fmt: skip
     done = finished_rows(out, recipe)
     if done is not None:
         progress(count)

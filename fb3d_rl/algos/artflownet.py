@@ -229,7 +229,7 @@ def load_trained(path: str | Path, name: str) -> CloudNetwork:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate the expert, a baseline that learns nothing, or what a trained network does, beside the expert."""
-    protocol = setup.evaluation_protocol(cfg, out)
+    protocol = setup.protocol(cfg)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     name, kind = cfg.policy.name, KINDS.get(cfg.policy.name)
     net = load_trained(cfg.checkpoint, name) if kind and cfg.checkpoint else None

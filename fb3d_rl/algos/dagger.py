@@ -305,7 +305,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate a trained learner beside the expert."""
-    protocol = setup.evaluation_protocol(cfg, out)
+    protocol = setup.protocol(cfg)
     expert = expert_policy(setup.velocity_limits(cfg), setup.flow_policy_options(cfg))
     assert cfg.checkpoint is not None  # config.validate has seen to it
     name, policy = load_policy(cfg.checkpoint, expert)

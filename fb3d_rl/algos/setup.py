@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 import torch
-import yaml
 
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
@@ -31,7 +30,7 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, ViewConfig
+    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, TrainConfig, ViewConfig
 
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
@@ -151,7 +150,7 @@ def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
     return VelocityLimits(gripper.v_max, gripper.w_max)
 
 
-def protocol(cfg: CommandConfig) -> Protocol:
+def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
     """What is evaluated.
 
     Raises:
@@ -176,33 +175,8 @@ def protocol(cfg: CommandConfig) -> Protocol:
             cfg.evaluation.repeats,
         ),
         decision_seconds=cfg.evaluation.decision_seconds,
+        resume=cfg.resume,
     )
-
-
-def evaluation_protocol(cfg: EvaluateConfig, out: Path) -> Protocol:
-    """What launch/evaluate.py evaluates.
-
-    Raises:
-        UserError: as :func:`protocol`; or it is to go on from an evaluation with other settings.
-    """
-    if cfg.resume and (out / "config.yaml").is_file():
-        before, now = (_flat(c) for c in (yaml.safe_load((out / "config.yaml").read_text()), asdict(cfg)))
-        for key, value in now.items():
-            # Where trials run changes no row.
-            if before.get(key) != value and key != "resume" and not key.startswith("collector."):
-                raise UserError(
-                    f"{out} was begun with {key}={before.get(key)}, not {value}; resume with the same settings, or "
-                    "choose another folder: hydra.run.dir=DIR"
-                )
-    return replace(protocol(cfg), resume=cfg.resume)
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Leaves of nested dicts by their dotted keys."""
-    found: dict[str, Any] = {}
-    for key, value in tree.items():
-        found |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return found
 
 
 def choose_device(name: str) -> torch.device:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.assets.partnet_mobility import load_object
+from fb3d_rl.assets.partnet_mobility import content_of, load_object
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.files import write_text
@@ -42,10 +42,10 @@ def generate_samples(
 
     Given the objects and the count, sample i depends on (seed, i) alone, whatever the number of workers. Objects take
     turns, so that each is seen equally often up to one. A finished data set in ``out`` that was made from the same
-    arguments is reused.
+    arguments, and objects of the same content wherever they lie, is reused.
 
     Args:
-        out: folder of the memory map; written anew unless it holds the same data set.
+        out: folder of the memory map; what an interrupted call left there is drawn anew.
         folders: PartNet-Mobility object folders.
         count: number of samples S.
         seed: base seed.
@@ -58,14 +58,14 @@ def generate_samples(
         "target" [S] int64, the index of the link to open (-1: all movable parts).
 
     Raises:
-        UserError: an object never shows an openable part, so no sample can be drawn of any.
+        UserError: none of the objects ever shows an openable part, or ``out`` holds another finished data set.
     """
     recipe = {
-        "objects": [str(folder.resolve()) for folder in folders],
+        "objects": [[folder.name, content_of(folder)] for folder in folders],
         "count": count,
         "seed": seed,
         "options": asdict(options),
-        "version": 1,
+        "version": 2,
     }
     done = finished_rows(out, recipe)
     if done is not None:
@@ -100,11 +100,27 @@ def generate_samples(
 
 
 def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:
-    """The rows of the finished data set in a folder, if they were made by this recipe."""
-    done = out / DONE
-    if done.is_file() and json.loads(done.read_text())["recipe"] == json.loads(json.dumps(recipe)):
-        return TensorDict.load_memmap(out / "rows")
-    return None
+    """The rows of the finished data set in a folder; None if there is none.
+
+    Raises:
+        UserError: they were made by another recipe, so that they are not this caller's to replace.
+    """
+    if not (out / DONE).is_file():
+        return None
+    kept, wanted = recipe_of(out), json.loads(json.dumps(recipe))
+    if kept != wanted:
+        differing = sorted(key for key in {*kept, *wanted} if kept.get(key) != wanted.get(key))
+        raise UserError(
+            f"{out} holds a finished data set that was made with other {', '.join(differing)}; choose another folder, "
+            "or remove it yourself"
+        )
+    return TensorDict.load_memmap(out / "rows")
+
+
+def recipe_of(out: Path) -> dict[str, Any]:
+    """How the finished data set in a folder was made."""
+    recipe: dict[str, Any] = json.loads((out / DONE).read_text())["recipe"]
+    return recipe
 
 
 def finish(out: Path, recipe: Mapping[str, Any], **facts: int) -> None:

@@ -15,7 +15,7 @@ from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import UserError
-from fb3d_rl.data.generate import DONE, generate_samples
+from fb3d_rl.data.generate import DONE, generate_samples, load_samples
 from fb3d_rl.data.samples import SampleOptions
 
 OPTIONS = SampleOptions(points=256, camera=CameraOptions(resolution=32))
@@ -73,9 +73,9 @@ def test_a_finished_set_is_reused(tmp_path: Path, folders: list[Path]) -> None:
 
 
 @pytest.mark.parametrize("change", ["points", "camera", "seed", "folders", "count"])
-def test_another_recipe_is_drawn_anew(tmp_path: Path, folders: list[Path], change: str) -> None:
+def test_another_recipe_never_removes_a_finished_set(tmp_path: Path, folders: list[Path], change: str) -> None:
     out = tmp_path / "s"
-    draw(out, folders)["observation", "points"][:] = 42.0
+    kept = draw(out, folders).clone()
     options, seed, chosen, count = OPTIONS, 0, folders, COUNT
     if change == "points":
         options = dataclasses.replace(OPTIONS, points=200)
@@ -87,10 +87,23 @@ def test_another_recipe_is_drawn_anew(tmp_path: Path, folders: list[Path], chang
         chosen = folders[:2]
     else:
         count = COUNT + 1
-    rows = generate_samples(out, chosen, count, seed, options, 0)
+    key = {"points": "options", "camera": "options", "folders": "objects"}.get(change, change)
+    with pytest.raises(UserError, match=f"with other {key};"):
+        generate_samples(out, chosen, count, seed, options, 0)
+    assert same(load_samples(out), kept)
+    rows = generate_samples(tmp_path / "fresh", chosen, count, seed, options, 0)
     assert rows["observation", "points"].shape == (count, options.points, 3)
-    assert not (rows["observation", "points"] == 42.0).any()
-    assert same(rows, generate_samples(tmp_path / "fresh", chosen, count, seed, options, 0))
+
+
+def test_a_set_is_known_by_the_content_of_its_objects_wherever_they_lie(tmp_path: Path, folders: list[Path]) -> None:
+    rows = draw(tmp_path / "s", folders)
+    rows["observation", "points"][0] = 42.0
+    moved = [Path(shutil.copytree(folder, tmp_path / "moved" / folder.name)) for folder in folders]
+    assert (draw(tmp_path / "s", moved)["observation", "points"][0] == 42.0).all()
+    urdf = moved[0] / "mobility.urdf"
+    urdf.write_text(urdf.read_text() + "\n")
+    with pytest.raises(UserError, match="with other objects"):
+        draw(tmp_path / "s", moved)
 
 
 def test_a_half_written_set_is_drawn_anew(tmp_path: Path, folders: list[Path]) -> None:
