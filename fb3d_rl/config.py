@@ -29,6 +29,8 @@ class AssetsConfig:
         train_count: procedural training objects of each category.
         eval_count: procedural held-out objects of each category; with "partnet_mobility" 0, or the splits
             "procedural_train_test" and "procedural_test" besides the real ones.
+        validation_share: share of the training objects of each category that is not trained on, but validated on while
+            training: what is chosen then, such as best.safetensors, is chosen by these.
     """
 
     source: str
@@ -40,6 +42,7 @@ class AssetsConfig:
     unseen_categories: list[str]
     train_count: int
     eval_count: int
+    validation_share: float
 
 
 @dataclass
@@ -177,7 +180,7 @@ class ImitationConfig(AlgoConfig):
         flow_checkpoint: an ArtFlowNet's checkpoint.pt, for ``learner.flow=artflownet``.
         demonstrations: a buffer that launch/demos.py recorded, imported or filtered, to start from.
         overlap: collect each next round while the last one is fitted, with the weights from before.
-        validate_trials: held-out trials after each round, for the learning curve.
+        validate_trials: trials with validation objects after each round, for the learning curve.
         loss: of a deterministic head: "l1", "l2" or "smooth_l1"; the Gaussian's is its likelihood.
         turn: situations are turned about z by up to so many degrees.
         mirror: every other situation is mirrored, at random.
@@ -442,6 +445,8 @@ def validate(cfg: CommandConfig) -> None:
     _at_least("data.eval_samples", cfg.data.eval_samples, 1)
     _at_least("data.workers", 0 if cfg.data.workers is None else cfg.data.workers, 0)
     _at_least("assets.eval_count", cfg.assets.eval_count, 1 if cfg.assets.source == "procedural" else 0)
+    if not 0 <= cfg.assets.validation_share < 1:
+        raise UserError(f"assets.validation_share={cfg.assets.validation_share} is no share; give a number from 0 to 1")
     _at_least("camera.resolution", cfg.camera.resolution, 8)
     if not 0 < cfg.camera.fov < 180:
         raise UserError(f"camera.fov={cfg.camera.fov} is no field of view; give degrees between 0 and 180")

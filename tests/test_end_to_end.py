@@ -77,6 +77,17 @@ def test_a_report_without_clouds(first: Path, tmp_path: Path, config: Config) ->
     assert names >= {"flow_rows.csv", "report.html"} and not names & {"clouds.npz", "flow.png"}
 
 
+def test_nothing_that_is_evaluated_is_looked_at_while_training(first: Path, tmp_path: Path, config: Config) -> None:
+    """The training log and what is chosen by it are the same whatever objects are evaluated in the end."""
+    others = ["assets.eval_count=2", "assets.unseen_categories=[Box]", "evaluation.trials=0"]
+    run(config("train", [*SMALL, *others]), tmp_path)
+    log = read_rows(tmp_path / "metrics.jsonl", times=False)
+    assert log == read_rows(first / "metrics.jsonl", times=False) and any("val/cosine" in row for row in log)
+    assert load_network(tmp_path / "best.safetensors").digest() == load_network(first / "best.safetensors").digest()
+    drawn = {name for name, _ in json.loads((first / "samples" / "samples.json").read_text())["recipe"]["objects"]}
+    assert len(drawn) == 3  # of two of each category, one is for validation
+
+
 @pytest.mark.slow
 def test_another_seed_gives_other_objects_and_weights(first: Path, tmp_path: Path, config: Config) -> None:
     run(config("train", [*SMALL, "seed=1"]), tmp_path)
@@ -103,10 +114,13 @@ def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path, config
 
 
 def test_a_kept_data_set_gives_the_same_run(first: Path, tmp_path: Path, config: Config) -> None:
-    own = [*SMALL, "evaluation.trials=0", "assets.train_count=1", "data.train_samples=1"]  # neither matters then
+    own = [*SMALL, "evaluation.trials=0", "data.train_samples=1"]  # which does not matter then
     run(config("train", [*own, f"data.dataset={first / 'samples'}"]), tmp_path)
     assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
     assert not (tmp_path / "samples").exists()
+    others = ["assets.train_count=20", "assets.validation_share=0.3"]  # validates on what was trained on
+    with pytest.raises(UserError, match="holds clouds of .* validated or evaluated on"):
+        run(config("train", [*own, *others, f"data.dataset={first / 'samples'}"]), tmp_path / "seen")
     with pytest.raises(UserError, match="no finished flow samples"):
         run(config("train", [*own, f"data.dataset={first}"]), tmp_path / "other")
 

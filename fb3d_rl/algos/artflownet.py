@@ -12,23 +12,27 @@ from typing import TYPE_CHECKING, Any, cast
 
 import torch
 from safetensors import safe_open
+from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import meet_samples
 from fb3d_rl.algos.kinds import KINDS
+from fb3d_rl.assets.catalog import Entry
 from fb3d_rl.contract import UserError, check
-from fb3d_rl.data.generate import Joined, generate_samples, load_samples
+from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.flow import held_out_samples
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.flow.metrics import mean_metrics
+from fb3d_rl.flow.opening import openable_links
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
+from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, emulates_bf16, fit, require_compiler
 from fb3d_rl.training.processes import rank_and_count, wait_for_all
@@ -41,6 +45,8 @@ CHECKPOINT = "checkpoint.pt"
 
 SAMPLES = "samples"
 """The run's data set; data.dataset gives it to another run."""
+
+VALIDATION_SAMPLES = 64
 
 MET = "met"
 """The clouds that the policy of data.met_by met."""
@@ -76,8 +82,10 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
             "note: this processor has no AVX-512, without which algo.precision=bf16 is several times slower than fp32"
         )
     samples = protocol.samples
-    train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
-    objects = setup.load(held_out)
+    entries = setup.train_entries(cfg.assets, out, cfg.seed)
+    train, objects = entries.train, setup.load(entries.held_out)
+    if cfg.data.dataset:
+        require_unseen(Path(cfg.data.dataset), [*entries.validation, *entries.held_out])
 
     if not cfg.data.dataset:
         draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES)
@@ -90,17 +98,14 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
             meet_samples(out / MET, loaded, acting, count, protocol, made_by, lambda n: bar.update(task, completed=n))
     wait_for_all()
     buffer = training_rows(cfg, out)
-    validation, about = held_out_samples(objects, samples, 2, cfg.seed + 1)["part"]
-    split_of_row = [split for _, split, _ in about]
+    validation = validation_samples(entries.validation, samples, cfg.seed)
 
     def validate(measured: nn.Module) -> dict[str, float]:
-        """On all held-out objects, and on those of each split where there are several."""
+        """On the validation objects: nothing that is evaluated in the end is looked at before."""
+        if validation is None:
+            return {}
         metrics = kind.measure(cast(CloudNetwork, measured), validation, device)
         numbers = {f"val/{key}": value for key, value in mean_metrics(metrics).items()}
-        for split in sorted(set(split_of_row)) if len(set(split_of_row)) > 1 else []:
-            rows = torch.tensor([other == split for other in split_of_row])
-            own = mean_metrics({key: value[rows] for key, value in metrics.items()})
-            numbers |= {f"val/{split}/{key}": value for key, value in own.items()}
         if numbers["val/cosine"] > best_cosine(out / BEST):
             about = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(cfg.seed), "git_revision": git_revision()}
             cast(CloudNetwork, measured).save_pretrained(out / BEST, about)
@@ -120,6 +125,32 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     policies[name] = kind.policy(net.to("cpu"), limits, speeds)
     return evaluate(out, objects, policies, protocol, setup.facts(cfg), net if kind.flow else None)
+
+
+def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:
+    """Samples of the validation objects, some ``VALIDATION_SAMPLES`` in all; None where there is no object."""
+    objects = setup.load(entries)
+    if not any(openable_links(obj) for obj, _ in objects):
+        return None
+    count = max(2, math.ceil(VALIDATION_SAMPLES / len(objects)))
+    return held_out_samples(objects, options, count, derived(seed, "validation"), ("part",))["part"][0]
+
+
+def require_unseen(dataset: Path, entries: list[Entry]) -> None:
+    """Check that a data set of another run holds none of the objects that this one validates and evaluates on.
+
+    Raises:
+        UserError: it does, or is none.
+    """
+    load_samples(dataset)
+    # Earlier versions kept folders in place of ids with digests.
+    drawn = {Path(item).name if isinstance(item, str) else item[0] for item in recipe_of(dataset)["objects"]}
+    seen = sorted(entry.id for entry in entries if entry.id in drawn)
+    if seen:
+        raise UserError(
+            f"data.dataset={dataset} holds clouds of {len(seen)} objects that are validated or evaluated on "
+            f"({', '.join(seen[:3])} ...): give the assets and the seed of the run that drew it"
+        )
 
 
 def assist(cfg: TrainConfig, out: Path) -> None:

@@ -41,6 +41,7 @@ from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
+from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, Objective, fit, generator
 from fb3d_rl.training.run_log import RunLog, open_logger
@@ -135,11 +136,14 @@ class Run:
         self.learner = new_learner(learner_options(algo), self.limits, algo.members, cfg.seed, flow_net)
         self.policy = InteractivePolicy(self.expert, self.learner, new_gate(algo))
         self.rows = rows_options(algo, self.limits, self.policy.gate)
-        train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
-        self.objects, self.tested = [entry.load() for entry in train], setup.load(held_out)
+        entries = setup.train_entries(cfg.assets, out, cfg.seed)
+        self.objects, self.tested = [entry.load() for entry in entries.train], setup.load(entries.held_out)
         self.views = [ObjectView(obj, self.protocol.samples.camera) for obj in self.objects]
         limit = algo.validate_trials
-        self.validation = schedule(self.tested, self.protocol.samples, cfg.seed, limit)[0] if limit else []
+        self.validated = setup.load(entries.validation)
+        if limit and not self.validated:
+            raise UserError(f"algo.validate_trials={limit} needs validation objects: more assets.validation_share")
+        self.validation = schedule(self.validated, self.protocol.samples, cfg.seed, limit)[0] if limit else []
 
         if saved is None:
             self.done = Progression()
@@ -261,10 +265,10 @@ class Run:
         nets.to("cpu")
 
     def validate(self) -> dict[str, float]:
-        """What the learner opens of a few held-out objects."""
+        """What the learner opens of a few validation objects."""
         if not self.validation:
             return {}
-        objects = [obj for obj, _ in self.tested]
+        objects = [obj for obj, _ in self.validated]
         options = setup.collector_options(self.cfg)
         policy = acting_policy(self.expert, self.learner, self.algo.oracle)
         rows = run_trials("learner", policy, objects, self.validation, self.protocol.env, collector=options)
@@ -343,10 +347,15 @@ def new_learner(
 ) -> Learner | Ensemble:
     """A learner, or an ensemble of several, with first weights that depend on the seed alone."""
     each = [
-        Learner(options, limits, torch.Generator().manual_seed(seed + 1000 * k), flow_net).eval()
+        Learner(options, limits, torch.Generator().manual_seed(_nth(seed, "member", k)), flow_net).eval()
         for k in range(members)
     ]
     return each[0] if members == 1 else Ensemble(each)
+
+
+def _nth(seed: int, what: str, number: int) -> int:
+    """The seed of member or round ``number``: the run's own for the first, else one that no other run has."""
+    return derived(seed, what, number) if number else seed
 
 
 def members(learner: Learner | Ensemble) -> list[Learner]:
@@ -415,7 +424,7 @@ def fit_options(algo: ImitationConfig, labels: int, seed: int, number: int) -> F
         lr=algo.lr,
         schedule=algo.schedule,
         clip_norm=algo.clip_norm,
-        seed=seed + 1000 * number,
+        seed=_nth(seed, "round", number),
         log_every=algo.log_every,
         checkpoint_every=algo.checkpoint_every,
     )
@@ -448,7 +457,7 @@ def imitation_objective(learner: Learner | Ensemble, algo: ImitationConfig, seed
     def objective(rows: TensorDictBase, step: int) -> Tensor:
         values = []
         for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
-            draws = torch.rand(2, len(rows), generator=generator(seed + k, TURN, step)).to(rows.device)
+            draws = torch.rand(2, len(rows), generator=generator(_nth(seed, "member", k), TURN, step)).to(rows.device)
             mirrored = (draws[1] < 0.5) & algo.mirror
             inputs, twist = turned(member.look(rows), rows["twist"], (2 * draws[0] - 1) * most, mirrored)
             inputs["twist"], inputs["is_pad"] = twist, rows["is_pad"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -14,6 +14,7 @@ import torch
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import Entry, entry_of, folder_entries, partnet_catalog, procedural_catalog
+from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import UserError
@@ -33,15 +34,29 @@ if TYPE_CHECKING:
     from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, TrainConfig, ViewConfig
 
 
-def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
-    """Objects to train on and objects to evaluate on."""
+@dataclass(frozen=True)
+class TrainEntries:
+    """The objects of a training run, none of them twice: to train on, to validate on meanwhile, to evaluate on."""
+
+    train: list[Entry]
+    validation: list[Entry]
+    held_out: list[Entry]
+
+
+def train_entries(assets: AssetsConfig, out: Path, seed: int) -> TrainEntries:
+    """The objects that training is about."""
     made = _made(assets, out, seed, assets.train_count)
     train = [entry for entry in made if entry.split == "train_train"]
     held_out = [entry for entry in made if entry.split != "train_train"]
-    if assets.source == "procedural":
-        return train, held_out
-    train = partnet_catalog(assets.root, assets.split, assets.split_file) + train
-    return train, partnet_catalog(assets.root, assets.eval_split, assets.split_file) + _beside_real(held_out)
+    if assets.source != "procedural":
+        train = partnet_catalog(assets.root, assets.split, assets.split_file) + train
+        held_out = partnet_catalog(assets.root, assets.eval_split, assets.split_file) + _beside_real(held_out)
+    kept = validation_ids({entry.id: entry.category for entry in train}, assets.validation_share)
+    if assets.validation_share and not kept:
+        print("note: too few training objects to keep one for validation; nothing is validated while training")
+    return TrainEntries(
+        [entry for entry in train if entry.id not in kept], [entry for entry in train if entry.id in kept], held_out
+    )
 
 
 def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:

@@ -6,6 +6,7 @@ UMPNet's lists (Xu, He, Song, RA-L 2022) are the reference: ``train_train`` (tra
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zlib
 from collections.abc import Mapping, Sequence
@@ -62,6 +63,23 @@ def split_of(name: str, category: str, table: Mapping[str, str]) -> str:
     if category not in TRAIN_CATEGORIES:
         return "test"
     return "train_test" if zlib.crc32(name.encode()) % 1000 < 1000 * HELD_OUT_SHARE else "train_train"
+
+
+def validation_ids(categories: Mapping[str, str], share: float) -> set[str]:
+    """Training objects that are kept for validation: of each category ``share``, rounded, by a stable hash of the ids.
+
+    Where that rounds to none, the largest category with two objects or more gives one.
+
+    Args:
+        categories: object id -> category of the training objects.
+        share: from 0, for none at all, to below 1.
+    """
+    ids: dict[str, list[str]] = {}
+    for name in sorted(categories, key=lambda name: hashlib.sha256(name.encode()).hexdigest()):
+        ids.setdefault(categories[name], []).append(name)
+    chosen = {name for names in ids.values() for name in names[: round(share * len(names))]}
+    largest = max(ids.values(), key=len, default=[])
+    return chosen or set(largest[: int(share > 0 and len(largest) > 1)])
 
 
 def select_ids(

@@ -15,10 +15,10 @@ from fb3d_rl.evaluation.page import text
 DASHES = ("solid", "dot", "dash")
 
 LEARNING = {
-    "success": {"val/success_rate": "held out", "collect/success_rate": "while collecting"},
-    "contact": {"val/contact_rate": "held out", "collect/contact_rate": "while collecting"},
+    "success": {"val/success_rate": "validation", "collect/success_rate": "while collecting"},
+    "contact": {"val/contact_rate": "validation", "collect/contact_rate": "while collecting"},
     "expert": {"collect/expert_share": "share of steps", "beta": "beta"},
-    "loss": {"train/loss": "training", "val/loss": "held out"},
+    "loss": {"train/loss": "training", "val/loss": "validation"},
 }
 """Panels of a run's learning curve: title -> key in the log -> what it is."""
 

@@ -22,7 +22,7 @@ from fb3d_rl.contract import Key, UserError, spec
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
-from fb3d_rl.env.workers import CollectorOptions, Episode, Workers, steady_floats
+from fb3d_rl.env.workers import CollectorOptions, Episode, Workers
 from fb3d_rl.evaluation.film import Film, record
 from fb3d_rl.evaluation.rollout import create_env, state_of
 from fb3d_rl.evaluation.trials import Scheduled, schedule
@@ -239,8 +239,7 @@ def replay(buffer: DemonstrationBuffer, episode: int, obj: ArticulatedObject) ->
     """
     info, frames = buffer.episodes[episode], buffer.frames(episode)
     options = replace(recorded_options(buffer), horizon=info.rows)
-    with steady_floats():  # as when it was recorded
-        film = record(f"episode {episode}", Replay(frames["action"]), obj, trial_of(info), options)
+    film = record(f"episode {episode}", Replay(frames["action"]), obj, trial_of(info), options)
     seen = torch.from_numpy(film.points[:-1]), torch.from_numpy(film.tips[:-1])
     kept = frames["observation", "points"], frames["observation", "tool_pose"][:, :3]
     return film, all(torch.equal(a, b) for a, b in zip(seen, kept, strict=True))

@@ -16,6 +16,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.views import View
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.torchrl_env import make_env
+from fb3d_rl.env.workers import steady_floats
 from fb3d_rl.evaluation.rollout import policy_env, state_of
 
 if TYPE_CHECKING:
@@ -81,7 +82,8 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
     env, task = policy_env(base, state_of(policy)), cast("OpenArticulatedEnv", base.env)
     poses, frames = [], []
     try:
-        with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        # As a worker runs it, or the episode may end otherwise than its row says.
+        with steady_floats(), set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             frame, done = env.reset(), False
             while True:
                 # After the last step the policy is asked once more, for what it predicts there.

@@ -21,9 +21,13 @@ TARGETS = ("part", "all")
 
 
 def held_out_samples(
-    objects: Sequence[tuple[ArticulatedObject, str]], options: SampleOptions, count: int, seed: int
+    objects: Sequence[tuple[ArticulatedObject, str]],
+    options: SampleOptions,
+    count: int,
+    seed: int,
+    targets: Sequence[str] = TARGETS,
 ) -> dict[str, tuple[TensorDictBase, list[tuple[ArticulatedObject, str, str]]]]:
-    """Draw ``count`` samples of each object for each target ("part", "all").
+    """Draw ``count`` samples of each object for each of ``targets`` ("part", "all").
 
     Returns:
         For each target the samples [S] (contract group "sample") and for each sample its object, split and link's
@@ -32,12 +36,12 @@ def held_out_samples(
     Raises:
         UserError: no object shows one.
     """
-    drawn: dict[str, tuple[list[TensorDict], list[tuple[ArticulatedObject, str, str]]]] = {t: ([], []) for t in TARGETS}
+    drawn: dict[str, tuple[list[TensorDict], list[tuple[ArticulatedObject, str, str]]]] = {t: ([], []) for t in targets}
     for obj, split in objects:
         view = ObjectView(obj, options.camera)
         if not view.openable:
             continue
-        for target in TARGETS:
+        for target in targets:
             wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0)
             for number in range(count):
                 rng = np.random.default_rng([seed, 4, zlib.crc32(obj.id.encode()), number])
@@ -46,7 +50,7 @@ def held_out_samples(
                     drawn[target][0].append(sample)
                     link = "*" if target == "all" else obj.links[int(sample["target"])].name
                     drawn[target][1].append((obj, split, link))
-    if not drawn["part"][0]:
+    if not any(samples for samples, _ in drawn.values()):
         raise UserError("none of the objects to evaluate on shows a part that opens; choose others or wider views")
     return {t: (lazy_stack(samples).contiguous(), about) for t, (samples, about) in drawn.items() if samples}
 

@@ -9,7 +9,10 @@ from typing import Any, TypeGuard
 
 LABELS, ROUND = "labels", "round"
 SHARE = "collect/expert_share"
-SUCCESSES = {"val/success_rate": "held-out success while training", "collect/success_rate": "success while collecting"}
+SUCCESSES = {
+    "val/success_rate": "validation success while training",
+    "collect/success_rate": "success while collecting",
+}
 """Learning curves: key in the log -> what it is."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,13 +20,14 @@ from fb3d_rl.contract import UserError
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:
     microwaves = [path.name for path in procedural_root.glob("*Microwave*")]
     root, out = str(procedural_root), tmp_path / "run"
-    mixed = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 0)
-    train, held_out = train_entries(mixed, out, seed=1)
+    mixed = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 0, 0.0)
+    entries = train_entries(mixed, out, seed=1)
+    train, held_out = entries.train, entries.held_out
     assert sorted(e.category for e in train) == ["Laptop"] * 3 + ["Microwave"] * len(microwaves)
     assert held_out and {e.category for e in held_out} == {"KitchenPot"}
 
-    alone = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 0)
-    assert [e.id for e in train_entries(alone, tmp_path / "alone", seed=1)[0]] == sorted(microwaves)
+    alone = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 0, 0.0)
+    assert [e.id for e in train_entries(alone, tmp_path / "alone", seed=1).train] == sorted(microwaves)
     assert not (tmp_path / "alone").exists()
 
 
@@ -33,8 +35,9 @@ def test_procedural_objects_beside_real_ones_are_evaluated_as_splits_of_their_ow
     tmp_path: Path, procedural_root: Path
 ) -> None:
     root = str(procedural_root)
-    both = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], ["Box"], 2, 1)
-    train, held_out = train_entries(both, tmp_path / "train", seed=1)
+    both = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], ["Box"], 2, 1, 0.0)
+    entries = train_entries(both, tmp_path / "train", seed=1)
+    train, held_out = entries.train, entries.held_out
     assert {(e.category, e.split) for e in train if e.category != "Microwave"} == {("Laptop", "train_train")}
     real, made = held_out[:-2], held_out[-2:]
     assert {e.category for e in real} == {"KitchenPot"}
@@ -48,11 +51,30 @@ def test_procedural_objects_beside_real_ones_are_evaluated_as_splits_of_their_ow
 
 
 def test_unseen_categories_are_evaluated_and_not_trained_on(tmp_path: Path) -> None:
-    assets = AssetsConfig("procedural", None, "all", "train_test", None, ["Laptop"], ["Box", "Bucket"], 2, 1)
-    train, held_out = train_entries(assets, tmp_path / "train", seed=1)
+    assets = AssetsConfig("procedural", None, "all", "train_test", None, ["Laptop"], ["Box", "Bucket"], 2, 1, 0.0)
+    entries = train_entries(assets, tmp_path / "train", seed=1)
+    train, held_out = entries.train, entries.held_out
     assert [(e.category, e.split) for e in train] == [("Laptop", "train_train")] * 2
     assert [(e.category, e.split) for e in held_out] == [("Laptop", "train_test"), ("Box", "test"), ("Bucket", "test")]
     assert [e.id for e in eval_entries(assets, tmp_path / "eval", seed=1)] == [e.id for e in held_out]
+
+
+def test_validation_objects_are_split_off_the_training_objects(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assets = AssetsConfig("procedural", None, "all", "train_test", None, ["Laptop", "Box"], [], 10, 2, 0.2)
+    entries = train_entries(assets, tmp_path / "a", seed=1)
+    assert Counter(e.category for e in entries.validation) == {"Laptop": 2, "Box": 2}
+    assert {e.split for e in entries.validation} == {"train_train"}
+    ids = [{e.id for e in part} for part in (entries.train, entries.validation, entries.held_out)]
+    assert [len(part) for part in ids] == [16, 4, 4] and len(set.union(*ids)) == 24
+    assert {e.id for e in train_entries(assets, tmp_path / "b", seed=1).validation} == ids[1], "a stable choice"
+    none = train_entries(replace(assets, validation_share=0.0), tmp_path / "c", seed=1)
+    assert {e.id for e in none.train} == ids[0] | ids[1] and not none.validation
+    assert "note" not in capsys.readouterr().out
+    single = train_entries(replace(assets, categories=["Box"], train_count=1), tmp_path / "d", seed=1)
+    assert len(single.train) == 1 and not single.validation
+    assert "nothing is validated" in capsys.readouterr().out
 
 
 def test_an_object_is_named_by_its_folder_its_id_or_its_category(

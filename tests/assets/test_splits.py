@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -15,11 +16,26 @@ from fb3d_rl.assets.splits import (
     read_split,
     select_ids,
     split_of,
+    validation_ids,
 )
 from fb3d_rl.contract import UserError
 
 CATEGORIES = {"1": "Laptop", "2": "Laptop", "3": "Oven", "4": "Table", "x-5": "Laptop"}
 TABLE = {"1": "train_train", "2": "train_test", "3": "test", "99": "test"}
+
+
+@pytest.mark.parametrize(
+    ("share", "count"),
+    [(0.1, {"A": 2, "B": 1}), (0.02, {"A": 1}), (0.0, {}), (0.4, {"A": 8, "B": 3})],
+)
+def test_validation_objects_are_a_share_of_each_category(share: float, count: dict[str, int]) -> None:
+    categories = {f"{c}{i}": c for c, number in (("A", 20), ("B", 8), ("C", 1)) for i in range(number)}
+    chosen = validation_ids(categories, share)
+    assert Counter(categories[name] for name in chosen) == count
+    assert validation_ids(dict(reversed(categories.items())), share) == chosen
+    more = categories | {f"D{i}": "D" for i in range(10)}
+    if share >= 0.1:
+        assert {name for name in validation_ids(more, share) if name in categories} == chosen
 
 
 def test_umpnets_lists_are_read_whole() -> None:

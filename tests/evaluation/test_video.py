@@ -343,6 +343,34 @@ def test_a_film_is_the_same_episode_again(microwave: ArticulatedObject) -> None:
     assert np.linalg.norm(film.flow[-1], axis=-1).max() == pytest.approx(1.0, abs=1e-5), "the truth"
 
 
+class Threads(TensorDictModuleBase):
+    """Flies on by what decides a sum's last bits: the number of threads, and whether denormal numbers are 0."""
+
+    in_keys = [("observation", "points")]
+    out_keys = ["action"]
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        tiny = torch.tensor(torch.finfo(torch.float32).tiny)
+        td["action"] = torch.zeros(*td.batch_size, 8)
+        td["action"][:, 0] = 0.1 * torch.get_num_threads() + 0.5 * float(bool(tiny / 2 == 0))
+        return td
+
+
+def test_a_film_computes_as_its_row_did(microwave: ArticulatedObject) -> None:
+    options = replace(OPTIONS, horizon=3)
+    items = schedule([(microwave, "s")], SampleOptions(points=300, camera=CAMERA), seed=0)[0][:1]
+    (row,) = run_trials("threads", Threads(), [microwave], items, options)
+    before = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        film = record("threads", Threads(), microwave, items[0].trial, options)
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert len(film) == row.steps + 1
+    assert float(np.linalg.norm(np.diff(film.tips.astype(float), axis=0), axis=1).sum()) == row.path_length
+
+
 def test_films_of_an_evaluation(microwave: ArticulatedObject, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     options = replace(OPTIONS, horizon=2)
     items = schedule([(microwave, "s")], SampleOptions(points=300, camera=CAMERA), seed=0)[0][:1]
