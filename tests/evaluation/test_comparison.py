@@ -438,6 +438,7 @@ def test_the_page_is_whole_and_loads_nothing(page: Page) -> None:
         assert not {"src", "data", "action"} & set(attrs), (tag, attrs)
         assert (attrs.get("href") or "#").startswith("#"), (tag, attrs)
         assert tag not in ("link", "iframe", "img", "base", "object", "embed")
+    assert len(page.figures) > 3
     for id_ in page.figures:
         assert sum(attrs.get("id") == id_ for _, attrs in page.tags) == 1, id_
 

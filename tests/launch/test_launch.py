@@ -91,7 +91,8 @@ def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"), [(["lap"], ["lap", "steps"]), (["--rounds", "0"], ["--rounds"]), (["--root", "no"], ["no"])]
+    ("arguments", "words"),
+    [(["lap"], ["lap", "steps"]), (["--rounds", "0"], ["--rounds"]), (["--root", "nowhere"], ["nowhere"])],
 )
 def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     sentence = sentence_of(launch("benchmark.py", *arguments, cwd=tmp_path))
