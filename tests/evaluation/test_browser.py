@@ -20,7 +20,7 @@ from fb3d_rl.evaluation.rows import FlowRow, TrialRow, film_name, write_flow, wr
 from fb3d_rl.evaluation.runs import read_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 LAPTOP, PHONE = (1366, 768), (390, 844)
 ENDS = ("", "lost hold", "stuck", "never touched the part", "crashed")

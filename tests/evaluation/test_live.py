@@ -366,6 +366,7 @@ def test_no_file_but_the_pages_own_is_given_away(server: Any, tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_in_a_browser_a_click_picks_a_point_and_play_opens_the_part(server: Any, oven: Session) -> None:
     playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
     if not shutil.which("chromium"):
