@@ -12,6 +12,8 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any, TypeAlias
 
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read by torch: its threads leave a busy core to others
+
 import pytest
 import torch
 from hydra import compose, initialize_config_dir

@@ -65,12 +65,12 @@ def same(a: Any, b: Any) -> bool:
 
 @pytest.mark.usefixtures("two_threads")
 def test_two_runs_have_the_same_bits() -> None:
-    """Three steps on two threads, from a memory-mapped buffer."""
+    """Ten steps on two threads, from a memory-mapped buffer."""
     buffer = ReplayBuffer(storage=LazyMemmapStorage(6), batch_size=4)
     buffer.extend(make_rows())
-    runs = [fit(make_net(), buffer, FitOptions(steps=3, batch_size=4), progress=False) for _ in range(2)]
+    runs = [fit(make_net(), buffer, FitOptions(steps=10, batch_size=4), progress=False) for _ in range(2)]
     assert same(runs[0]["model"], runs[1]["model"])
-    other = fit(make_net(), buffer, FitOptions(steps=3, batch_size=4, seed=1), progress=False)
+    other = fit(make_net(), buffer, FitOptions(steps=10, batch_size=4, seed=1), progress=False)
     assert not same(runs[0]["model"], other["model"])
 
 
