@@ -12,7 +12,10 @@ from pathlib import Path
 from subprocess import CompletedProcess
 from typing import Any, TypeAlias
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read by torch: its threads leave a busy core to others
+# Read by torch and numpy when they are imported, here and in what the tests start.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that wait leave the core to others
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"  # each of pytest's processes has a core
 
 import pytest
 import torch
@@ -28,10 +31,6 @@ from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, Tr
 
 ROOT = Path(__file__).resolve().parents[1]
 Launch: TypeAlias = "Callable[..., CompletedProcess[str]]"
-
-if "PYTEST_XDIST_WORKER" in os.environ:  # each worker has a core of its own; what the tests start has it from here
-    os.environ["OMP_NUM_THREADS"] = "1"
-    torch.set_num_threads(1)
 
 
 @pytest.fixture
