@@ -265,6 +265,15 @@ def test_parts_touch_nothing_while_they_move(objects: list[tuple[Path, Link, lis
                         assert separation(moved, others[k]) > GAP, (path.name, link.semantic, share)
 
 
+def test_parts_that_touch_are_found(folder: Path) -> None:
+    path = folder / f"proc-StorageFurniture-{SEED}-0000"
+    body, movable = read(path)
+    for mesh in movable[0].meshes:  # into the body's middle
+        mesh.vertices = mesh.vertices + body.meshes[0].centroid - movable[0].meshes[0].centroid
+    with pytest.raises(AssertionError, match="StorageFurniture"):
+        test_parts_touch_nothing_while_they_move([(path, body, movable)])
+
+
 def test_flow_is_nonzero_exactly_on_what_moves(objects: list[tuple[Path, Link, list[Link]]]) -> None:
     for path, _, _ in objects:
         obj = load_object(path)

@@ -279,5 +279,5 @@ def test_bad_input_ends_with_one_sentence_and_exit_code_2(
 )
 def test_unreadable_files_are_named(tmp_path: Path, name: str, content: str) -> None:
     (tmp_path / name).write_text(content)
-    with pytest.raises(UserError, match=name):
+    with pytest.raises(UserError, match=rf"{re.escape(str(tmp_path / name))}(:| is|, line)"):
         write_report(tmp_path)
