@@ -1,18 +1,29 @@
 # make train   .venv, then the main job on the embedded default
 # make test    .venv, then the default tests
+# make slow    .venv, then the slow ones
 # make check   lint, types and import rules
 # make lock    pin the dependencies anew
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: train test check lock clean
+.PHONY: install train test slow check lock clean
+
+install: $(VENV)/installed
 
 train: $(VENV)/installed
 	$(BIN)/python launch/train.py algo=artflownet
 
+# Two processes, each with the tests of a file at a time, whose fixtures they share.
+PYTEST = $(BIN)/python -m pytest -n 2 --dist loadfile
+
 test: $(VENV)/installed
-	$(BIN)/python -m pytest -m "not slow"
+	$(PYTEST) -m "not slow"
+
+# What waits for pictures or measures time has the machine to itself.
+slow: $(VENV)/installed
+	$(PYTEST) -m "slow and not alone"
+	$(BIN)/python -m pytest -m "slow and alone"
 
 check: $(VENV)/installed
 	$(BIN)/ruff check .

@@ -2,20 +2,77 @@
 
 from __future__ import annotations
 
+import logging
+import multiprocessing
 import os
-from collections.abc import Callable
+import runpy
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from subprocess import CompletedProcess
+from typing import Any, TypeAlias
+
+# Read by torch and numpy when they are imported, here and in what the tests start.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that wait leave the core to others
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"  # each of pytest's processes has a core
 
 import pytest
+import torch
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
 from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
+
+ROOT = Path(__file__).resolve().parents[1]
+Launch: TypeAlias = "Callable[..., CompletedProcess[str]]"
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Torch computes on two threads, however many it has otherwise."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def launch(tmp_path_factory: pytest.TempPathFactory) -> Launch:
+    """Runs a command as ``python launch/<script> <arguments>`` would, in a process that is forked from this one.
+
+    That saves the seconds that the imports take, and with them what they might write; tests/launch starts Python, too.
+    """
+    folder = tmp_path_factory.mktemp("launch")
+
+    def launched(script: str, *arguments: str, cwd: Path) -> CompletedProcess[str]:
+        process = multiprocessing.get_context("fork").Process(target=_run, args=(script, arguments, cwd, folder))
+        process.start()
+        process.join(120)
+        process.kill()  # if it has not ended
+        process.join()
+        stdout, stderr = ((folder / name).read_text() for name in ("stdout", "stderr"))
+        return CompletedProcess([script, *arguments], process.exitcode or 0, stdout, stderr)
+
+    return launched
+
+
+def _run(script: str, arguments: tuple[str, ...], cwd: Path, folder: Path) -> None:
+    """Become the process of a command, whose outputs are files."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        os.dup2(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+        setattr(sys, name, open(number, "w", buffering=1))
+    logging.getLogger().handlers.clear()  # pytest's
+    GlobalHydra.instance().clear()
+    os.chdir(cwd)
+    sys.argv = [script, *arguments]
+    sys.path.insert(0, str(ROOT / "launch"))
+    runpy.run_path(str(ROOT / "launch" / script), run_name="__main__")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -65,7 +122,7 @@ def config(schemas: None) -> Callable[[str, list[str]], Any]:
     """Composes and checks conf/<name>.yaml with overrides, as the command of that name does."""
 
     def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig | ViewConfig:
-        with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
             cfg = OmegaConf.to_object(compose(name, overrides))
         validate(cfg)
         return cfg

@@ -107,7 +107,7 @@ def choose_contact(
         points that would do as well [B, CANDIDATES, CANDIDATE], for :func:`best_candidate`. All are 0 for a cloud
         without flow; so are the candidates beyond the last one.
     """
-    norm = flow.norm(dim=-1)
+    norm = flow.norm(dim=-1).masked_fill(~valid, 0.0)
     largest = norm.amax(-1, keepdim=True)
     cloud, seen, obstacle = points, valid, valid & ~part
     moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen

@@ -114,6 +114,7 @@ def test_without_a_cache_objects_are_read_all_the_same(
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_real_objects_are_read_ten_times_as_fast_again(own: Path, real_root: Path, parses: list[Path]) -> None:
     folders = find_folders(real_root).values()
     begin = time.process_time()

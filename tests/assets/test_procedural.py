@@ -23,7 +23,7 @@ from fb3d_rl.contract import UserError
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
 from fb3d_rl.flow.kinematics import KinematicTree
 
-PER_FAMILY = 6
+PER_FAMILY = 4
 SEED = 3
 GAP = 0.002  # m, kept between links at every joint position
 
@@ -265,6 +265,15 @@ def test_parts_touch_nothing_while_they_move(objects: list[tuple[Path, Link, lis
                         assert separation(moved, others[k]) > GAP, (path.name, link.semantic, share)
 
 
+def test_parts_that_touch_are_found(folder: Path) -> None:
+    path = folder / f"proc-StorageFurniture-{SEED}-0000"
+    body, movable = read(path)
+    for mesh in movable[0].meshes:  # into the body's middle
+        mesh.vertices = mesh.vertices + body.meshes[0].centroid - movable[0].meshes[0].centroid
+    with pytest.raises(AssertionError, match="StorageFurniture"):
+        test_parts_touch_nothing_while_they_move([(path, body, movable)])
+
+
 def test_flow_is_nonzero_exactly_on_what_moves(objects: list[tuple[Path, Link, list[Link]]]) -> None:
     for path, _, _ in objects:
         obj = load_object(path)
@@ -287,7 +296,7 @@ def test_flow_is_nonzero_exactly_on_what_moves(objects: list[tuple[Path, Link, l
             )
 
 
-@settings(max_examples=60, deadline=None, derandomize=True, database=None)
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(st.sampled_from(list(FAMILIES)), st.integers(0, 2**31), st.integers(0, 9999))
 def test_what_holds_for_these_holds_for_any_seed(category: str, seed: int, index: int) -> None:
     any_seed(category, seed, index)

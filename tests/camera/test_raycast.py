@@ -77,7 +77,7 @@ def test_points_lie_on_the_surface_of_a_box_and_on_its_visible_side(view: View) 
     side = np.sign(local(points, pose)[rows, face])
     ends = np.sort(inside, axis=-1)
     clear = ends[:, 2] - ends[:, 1] > 1e-3  # not on an edge
-    assert (side[clear] * eye[face[clear]] > half[face[clear]]).all()
+    assert clear.mean() > 0.9 and (side[clear] * eye[face[clear]] > half[face[clear]]).all()
 
 
 def test_points_lie_on_the_near_side_of_a_sphere() -> None:
@@ -108,6 +108,7 @@ def test_azimuth_and_elevation_choose_the_side_that_is_seen() -> None:
         (View(0.0, 90.0), 2, 1.0),
     ):
         points, _ = camera.capture(poses, view)
+        assert len(points) > 100
         np.testing.assert_allclose(points[:, axis], value, atol=1e-4)
     above, _ = camera.capture(poses, View(0.0, 45.0))
     assert (above[:, 2] > 1.0 - 1e-4).any() and (above[:, 0] < -0.5 + 1e-4).any()
@@ -181,7 +182,7 @@ def test_points_on_further_bodies_can_be_left_out() -> None:
     before[:3, 3] = (-1.0, 0.0, 0.5)
     points, links = camera.capture(still(1, before), FRONT)
     alone, ids = camera.capture(still(1, before), FRONT, further=False)
-    assert (links == 1).any() and (ids == 0).all()
+    assert (links == 1).any() and len(ids) > 100 and (ids == 0).all()
     np.testing.assert_array_equal(alone, points[links == 0])
 
 
@@ -255,7 +256,7 @@ def test_a_frame_that_fails_leaves_no_trace() -> None:
     before = camera.capture(still(2), FRONT)
     with pytest.raises(ValueError, match="1 poses .* 2 links"):
         camera.capture(still(1), View(40.0, 35.0))
-    with pytest.raises((ValueError, IndexError)):
+    with pytest.raises(ValueError, match="shapes"):
         camera.capture(np.zeros((2, 3, 3)), View(40.0, 35.0))
     for a, b in zip(before, camera.capture(still(2), FRONT), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -310,6 +311,7 @@ def test_pictures_repeat_bit_for_bit(procedural_objects: dict[str, ArticulatedOb
     obj = procedural_objects["Microwave"]
     poses = KinematicTree.from_object(obj).forward(torch.zeros(len(obj.movable))).numpy()
     first, second = (RaycastCamera(obj, options=OPTIONS).capture(poses, View(13.0, 29.0)) for _ in range(2))
+    assert len(first[0]) > 100
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
 

@@ -83,6 +83,7 @@ def test_a_sample_follows_from_its_generator_alone(views: list[ObjectView]) -> N
 
 def test_direction_points_towards_opening(views: list[ObjectView]) -> None:
     for view in views:
+        assert view.openable
         for link in view.openable:
             direction = view.direction(link)
             j = view.obj.movable.index(link)

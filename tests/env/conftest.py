@@ -15,6 +15,7 @@ from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
 from fb3d_rl.env.options import EnvOptions, GripperOptions, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
+from fb3d_rl.flow.opening import openable_links
 
 POINTS = 256
 
@@ -36,11 +37,14 @@ def env(objects: dict[str, ArticulatedObject]) -> OpenArticulatedEnv:
 
 @pytest.fixture(scope="session")
 def real_objects() -> list[ArticulatedObject]:
-    """A few objects of the real dataset."""
+    """A few objects of the real dataset, of which something opens."""
     root = os.environ.get("FB3D_PARTNET_MOBILITY")
     if not root:
         pytest.skip("FB3D_PARTNET_MOBILITY is unset; set it to the folder of PartNet-Mobility objects")
-    return [load_object(path.parent) for path in sorted(Path(root).glob("*/mobility.urdf"))[::20]]
+    loaded = [load_object(path.parent) for path in sorted(Path(root).glob("*/mobility.urdf"))[::20]]
+    found = [obj for obj in loaded if openable_links(obj)]
+    assert found, f"{root} holds no object that opens"
+    return found
 
 
 def links_called(obj: ArticulatedObject, semantic: str) -> list[int]:

@@ -43,8 +43,8 @@ def test_pulling_without_touch_moves_nothing(env: OpenArticulatedEnv, objects: d
 def test_engaging_does_not_throw_the_hand(env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]) -> None:
     drawer = links_called(objects["Table"], "drawer")[0]
     place_before(env, drawer, start(env, objects["Table"], drawer))
-    step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
-    assert env.stages[0].suction.stretch < 0.01
+    held, _ = step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
+    assert held and env.stages[0].suction.stretch < 0.01
     before = env.agent.tool_pose()
     for _ in range(5):
         obs, *_ = env.step(velocity())
@@ -87,7 +87,8 @@ def test_suction_breaks_and_is_found_again(objects: dict[str, ArticulatedObject]
     drawer = links_called(obj, "drawer")[0]
     env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(breaking_force=40.0)))
     place_before(env, drawer, start(env, obj, drawer))
-    step_until(env, velocity(x=0.1), lambda: env.stages[0].suction.attached)
+    held, _ = step_until(env, velocity(x=0.1), lambda: env.stages[0].suction.attached)
+    assert held
     lost, (*_, info) = step_until(env, velocity(x=-0.8), lambda: not env.stages[0].suction.attached, limit=20)
     assert lost and bool(info["contact"])
     for _ in range(10):
@@ -102,7 +103,8 @@ def test_contact_stays_on_while_a_part_is_held(env: OpenArticulatedEnv, objects:
     obj = objects["StorageFurniture"]  # starts closed: the drawer cannot give way
     drawer = links_called(obj, "drawer")[0]
     place_before(env, drawer, start(env, obj, drawer))
-    step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
+    held, _ = step_until(env, velocity(x=0.2), lambda: env.stages[0].suction.attached)
+    assert held
     before = env.agent.tool_pose()
     for _ in range(10):
         obs, *_ = env.step(velocity(x=0.1))

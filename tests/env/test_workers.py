@@ -8,7 +8,6 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
 from functools import partial
 
 import pytest
@@ -118,10 +117,12 @@ def test_keys_choose_what_is_kept(create: partial[TrialEnv], trials: list[Trial]
     assert set(frames(episode).keys(include_nested=True, leaves_only=True)) == {("next", "success"), "action"}
 
 
-def check(backend: str, create: partial[TrialEnv], trials: list[Trial], expected: dict[float, list[Episode]]) -> str:
+def check(
+    backend: str, restarts: int, create: partial[TrialEnv], trials: list[Trial], expected: dict[float, list[Episode]]
+) -> str:
     """Run the scenario of ``expected`` in two workers, where the drawer kills its worker; return the error."""
     policy = Policy("kill")
-    with Workers(create, policy, CollectorOptions(backend, 2, restarts=2), HORIZON) as workers:  # type: ignore[arg-type]
+    with Workers(create, policy, CollectorOptions(backend, 2, restarts), HORIZON) as workers:  # type: ignore[arg-type]
         for weight in (0.0, 0.25):
             policy.set_weight(weight)
             workers.update_policy_weights_()
@@ -135,31 +136,32 @@ def check(backend: str, create: partial[TrialEnv], trials: list[Trial], expected
         assert all(errors[:2]) and not any(errors[2:])
         # Both workers died, so the frames are of workers that were started again, with the present weights.
         assert all(same(episodes[2 + k], expected[0.75][j]) for k, j in enumerate((0, 2, 3)))
-        # No restart is left: with two more deaths there is no worker for the rest, which is said.
+        # No restart is left: with as many deaths again there is no worker for the rest, which is said.
         lost = run(workers, drawers_first)
-        assert all("died" in episode.error for episode in lost[:2])
-        assert [episode.error.split(":")[0] for episode in lost[2:]] == ["not run"] * 3
+        assert all("died" in episode.error for episode in lost[:restarts])
+        assert [episode.error.split(":")[0] for episode in lost[restarts:]] == ["not run"] * (5 - restarts)
     return errors[0]
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_worker_processes(
     create: partial[TrialEnv],
     trials: list[Trial],
     expected: dict[float, list[Episode]],
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    before, threads = multiprocessing.active_children(), torch.get_num_threads()
+    before = multiprocessing.active_children()
     with caplog.at_level(logging.ERROR, logger="fb3d_rl"):
-        error = check("process", create, trials, expected)
+        error = check("process", 1, create, trials, expected)
     assert error == "its worker process died of signal 9 (Killed)"
     assert f"object {trials[1].object}, link {trials[1].link}, seed {trials[1].seed}: {error}" in caplog.text
-    assert multiprocessing.active_children() == before and torch.get_num_threads() == threads
+    assert multiprocessing.active_children() == before and torch.get_num_threads() == 2
 
 
 @pytest.mark.slow
 def test_ray(create: partial[TrialEnv], trials: list[Trial], expected: dict[float, list[Episode]]) -> None:
     ray = pytest.importorskip("ray", reason="Ray is not installed; install it to run this test")
-    assert "its Ray worker died" in check("ray", create, trials, expected)
+    assert "its Ray worker died" in check("ray", 2, create, trials, expected)
     # The finalizer of a collector that still has actors starts Ray anew.
     left = [thing for thing in gc.get_objects() if isinstance(thing, RayCollector) and thing.remote_collectors]
     assert not left and not ray.is_initialized()
@@ -193,14 +195,6 @@ def test_what_keeps_workers_from_starting_is_raised(trials: list[Trial]) -> None
     ):
         run(workers, trials)
     assert multiprocessing.active_children() == before
-
-
-@pytest.fixture
-def two_threads() -> Iterator[None]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -78,15 +78,15 @@ def test_reading_begins_with_an_empty_cache_and_leaves_none(objects: list[Articu
     assert 0 < found["read again, s"] < found["first read, s"]
 
 
+@pytest.mark.usefixtures("two_threads")
 def test_one_core_is_given_back() -> None:
-    threads = torch.get_num_threads()
     before = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
     with pytest.raises(KeyError), benchmark.one_core():
         assert torch.get_num_threads() == 1
         if before is not None:
             assert len(os.sched_getaffinity(0)) == 1
         raise KeyError
-    assert torch.get_num_threads() == threads
+    assert torch.get_num_threads() == 2
     if before is not None:
         assert os.sched_getaffinity(0) == before
 
@@ -125,6 +125,7 @@ def test_random_actions_leave_numbers_and_memory_alone(objects: list[Articulated
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_workers_are_compared_without_their_start(objects: list[ArticulatedObject]) -> None:
     scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(points=128), seed=0)
     found = benchmark.worker_scaling(objects, 3 * scheduled, OPTIONS, rounds=1, progress=silent)

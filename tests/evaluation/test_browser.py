@@ -20,7 +20,7 @@ from fb3d_rl.evaluation.rows import FlowRow, TrialRow, film_name, write_flow, wr
 from fb3d_rl.evaluation.runs import read_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.alone]
 
 LAPTOP, PHONE = (1366, 768), (390, 844)
 ENDS = ("", "lost hold", "stuck", "never touched the part", "crashed")
@@ -124,11 +124,14 @@ def test_every_figure_is_drawn_and_nothing_is_wider_than_the_screen(
         page = visit(path, size)
         names = page.eval_on_selector_all("script[data-figure]", "nodes => nodes.map(node => node.dataset.figure)")
         assert len(names) > 3
+        shown = 0
         for name in names:
             drawn = page.locator(f"#{name} .main-svg")
             drawn.first.wait_for(state="attached")
             box = page.locator(f"#{name}").bounding_box()
-            assert box is None or box["width"] <= size[0], name
+            assert box is None or box["width"] <= size[0], name  # None: of a policy that is not chosen
+            shown += box is not None
+        assert shown > 3
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
 
 

@@ -18,6 +18,7 @@ def silent(text: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_every_contender_has_its_numbers(
     procedural_objects: dict[str, ArticulatedObject], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,6 +1,6 @@
 """The commands: what the user can mend ends in exit code 2 and one sentence, at once and without a trace.
 
-Each start costs seconds, so most of these tests are marked slow.
+To start Python and import costs seconds, so most of these commands are forked.
 """
 
 from __future__ import annotations
@@ -9,14 +9,18 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+Launch: TypeAlias = "Callable[..., subprocess.CompletedProcess[str]]"
 
 
-def launch(script: str, *arguments: str, cwd: Path, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+def start(script: str, *arguments: str, cwd: Path, python: tuple[str, ...] = ()) -> subprocess.CompletedProcess[str]:
+    """In a Python of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *python, str(ROOT / "launch" / script), *arguments]
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, check=False)
@@ -34,36 +38,42 @@ def sentence_of(result: subprocess.CompletedProcess[str]) -> str:
     ("arguments", "words"),
     [
         (["algo.epcohs=5"], ["epcohs"]),
-        pytest.param(["algo=ppo"], ["ppo", "artflownet"], marks=pytest.mark.slow),
-        pytest.param(["device=gpu"], ["device=gpu", "cuda"], marks=pytest.mark.slow),
-        pytest.param(["algo.epochs=many"], ["algo.epochs", "many"], marks=pytest.mark.slow),
-        pytest.param(["assets=partnet_mobility"], ["assets.root"], marks=pytest.mark.slow),
+        (["algo=ppo"], ["ppo", "artflownet"]),
+        (["device=gpu"], ["device=gpu", "cuda"]),
+        (["algo.epochs=many"], ["algo.epochs", "many"]),
+        (["assets=partnet_mobility"], ["assets.root"]),
         (["assets=partnet_mobility", "assets.root=nowhere"], ["assets.root", "nowhere"]),
     ],
 )
 def test_what_is_wrong_is_said_in_one_sentence_before_any_work(
-    tmp_path: Path, arguments: list[str], words: list[str]
+    launch: Launch, tmp_path: Path, arguments: list[str], words: list[str]
 ) -> None:
     sentence = sentence_of(launch("train.py", *arguments, cwd=tmp_path))
     assert all(word in sentence for word in words), sentence
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_a_root_without_objects_leaves_no_run_folder(tmp_path: Path) -> None:
+def test_a_python_of_its_own_says_the_same_and_no_more(launch: Launch, tmp_path: Path) -> None:
+    """After all that it imports, too."""
+    arguments = ["assets=partnet_mobility", "assets.root=nowhere"]
+    alone, forked = (how("train.py", *arguments, cwd=tmp_path) for how in (start, launch))
+    assert sentence_of(alone) == sentence_of(forked)
+
+
+def test_a_root_without_objects_leaves_no_run_folder(launch: Launch, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     arguments = ["assets=partnet_mobility", f"assets.root={tmp_path / 'empty'}", "hydra.run.dir=out"]
     assert "assets.root" in sentence_of(launch("train.py", *arguments, cwd=tmp_path))
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_named(launch: Launch, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     sentence = sentence_of(launch("train.py", "hydra.run.dir=file/run", cwd=tmp_path))
     assert "file/run" in sentence and "hydra.run.dir" in sentence
 
 
-@pytest.mark.slow
-def test_a_run_folder_in_use_is_left_alone(tmp_path: Path) -> None:
+def test_a_run_folder_in_use_is_left_alone(launch: Launch, tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "notes.txt").write_text("mine")
     arguments = ["resume=true", "hydra.run.dir=run", "assets.categories=[Spaceship]"]
@@ -71,8 +81,7 @@ def test_a_run_folder_in_use_is_left_alone(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "notes.txt").read_text() == "mine"
 
 
-@pytest.mark.slow
-def test_evaluation_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
+def test_evaluation_without_a_checkpoint_is_refused(launch: Launch, tmp_path: Path) -> None:
     assert "checkpoint" in sentence_of(launch("evaluate.py", "policy=artflownet", cwd=tmp_path))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
@@ -82,7 +91,7 @@ def test_evaluation_without_a_checkpoint_is_refused(tmp_path: Path) -> None:
     ["train.py", "report.py", *(pytest.param(name, marks=pytest.mark.slow) for name in ("evaluate.py", "view.py"))],
 )
 def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> None:
-    result = launch(script, "--help", cwd=tmp_path, python=("-X", "importtime"))
+    result = start(script, "--help", cwd=tmp_path, python=("-X", "importtime"))
     assert result.returncode == 0 and result.stdout
     imported = {line.rsplit("|", 1)[-1].strip().split(".")[0] for line in result.stderr.splitlines() if "|" in line}
     assert "pathlib" in imported
@@ -91,9 +100,12 @@ def test_help_comes_without_the_heavy_imports(tmp_path: Path, script: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"), [(["lap"], ["lap", "steps"]), (["--rounds", "0"], ["--rounds"]), (["--root", "no"], ["no"])]
+    ("arguments", "words"),
+    [(["lap"], ["lap", "steps"]), (["--rounds", "0"], ["--rounds"]), (["--root", "nowhere"], ["nowhere"])],
 )
-def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+def test_the_benchmark_says_what_is_wrong(
+    launch: Launch, tmp_path: Path, arguments: list[str], words: list[str]
+) -> None:
     sentence = sentence_of(launch("benchmark.py", *arguments, cwd=tmp_path))
     assert all(word in sentence for word in words), sentence
     assert not list(tmp_path.iterdir())
@@ -103,12 +115,12 @@ def test_the_benchmark_says_what_is_wrong(tmp_path: Path, arguments: list[str], 
     ("arguments", "words"),
     [
         (["object=Spaceship"], ["Spaceship", "Microwave"]),
-        pytest.param(["port=99999"], ["port=99999", "65535"], marks=pytest.mark.slow),
-        pytest.param(["checkpoint=nowhere.safetensors"], ["nowhere.safetensors"], marks=pytest.mark.slow),
+        (["port=99999"], ["port=99999", "65535"]),
+        (["checkpoint=nowhere.safetensors"], ["nowhere.safetensors"]),
     ],
 )
 def test_the_live_page_says_what_is_wrong_and_leaves_nothing(
-    tmp_path: Path, arguments: list[str], words: list[str]
+    launch: Launch, tmp_path: Path, arguments: list[str], words: list[str]
 ) -> None:
     pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
     sentence = sentence_of(launch("view.py", *arguments, cwd=tmp_path))
@@ -119,11 +131,11 @@ def test_the_live_page_says_what_is_wrong_and_leaves_nothing(
 @pytest.mark.slow
 def test_a_sweep_trains_each_and_the_report_merges_them(tmp_path: Path) -> None:
     small = ["experiment=smoke", "data.labels=40", "evaluation.expert=false", "evaluation.trials=1"]
-    swept = launch("train.py", "-m", *small, "algo=artflownet,bc", "hydra.sweep.dir=sweep", cwd=tmp_path)
+    swept = start("train.py", "-m", *small, "algo=artflownet,bc", "hydra.sweep.dir=sweep", cwd=tmp_path)
     assert swept.returncode == 0, swept.stderr
     runs = sorted(path.parent for path in (tmp_path / "sweep").rglob("summary.json"))
     assert {json.loads((run / "summary.json").read_text())["policy"] for run in runs} == {"artflownet", "bc"}
-    merged = launch("report.py", "sweep", cwd=tmp_path)
+    merged = start("report.py", "sweep", cwd=tmp_path)
     assert merged.returncode == 0, merged.stderr
     table = merged.stdout
     assert "artflownet" in table and "bc" in table

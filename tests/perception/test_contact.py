@@ -34,6 +34,11 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
     )[:3]
 
 
+def on(points: torch.Tensor, contact: torch.Tensor) -> bool:
+    """Whether the contact is a point of the cloud; where none is chosen it is 0."""
+    return bool((points[0] == contact[0]).all(-1).any())
+
+
 def hinge_flow(points: torch.Tensor) -> torch.Tensor:
     """A plate hinged at y = 0.5 that opens towards -x: flow [1, N, 3] with largest norm 1."""
     return torch.stack([points[..., 1] - 0.5, torch.zeros_like(points[..., 1]), torch.zeros_like(points[..., 1])], -1)
@@ -54,7 +59,7 @@ def test_a_rough_spot_is_left_for_a_flat_one_at_least_2_cm_away() -> None:
     bumps = torch.rand(points.shape[:2], generator=torch.Generator().manual_seed(0))
     points[..., 0] = torch.where(rough, -0.1 * bumps, points[..., 0])
     contact, _, _ = choose(points, hinge_flow(points), min_flow=0.3)
-    assert contact[0, 1] >= -0.25
+    assert on(points, contact) and contact[0, 1] >= -0.25
 
 
 def test_does_not_choose_what_the_hand_cannot_reach() -> None:
@@ -63,7 +68,7 @@ def test_does_not_choose_what_the_hand_cannot_reach() -> None:
     cloud = torch.cat([points, shelf[None]], dim=1)
     flow = torch.cat([hinge_flow(points), torch.zeros(1, len(shelf), 3)], dim=1)
     contact, _, _ = choose(cloud, flow, min_flow=0.1)
-    assert contact[0, 1] > 0.1
+    assert on(points, contact) and contact[0, 1] > 0.1
 
 
 def test_avoids_points_tried_before() -> None:
@@ -72,7 +77,7 @@ def test_avoids_points_tried_before() -> None:
     first, _, _ = choose(points, flow)
     avoid = (points - first[:, None]).norm(dim=-1) < 0.2
     second, _, _ = choose(points, flow, avoid)
-    assert (first - second).norm() >= 0.2
+    assert on(points, first) and on(points, second) and (first - second).norm() >= 0.2
 
 
 def test_a_sash_that_slides_in_its_plane_is_touched_along_its_normal() -> None:
@@ -102,7 +107,7 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
         torch.zeros_like(valid),
         ContactOptions(min_flow=0.0),
     )
-    assert not (points[0, :300] == contact[0]).all(-1).any()
+    assert on(points[:, 300:], contact) and not on(points[:, :300], contact)
 
 
 def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_line_of_sight() -> None:
@@ -128,7 +133,7 @@ def test_the_hand_does_not_come_from_below_the_ground(height: float) -> None:
     _, _, standoff, _ = choose_contact(
         points, valid, valid, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
-    assert standoff[0, 2] > -0.1
+    assert standoff[0, 2] > -0.1 and standoff.norm() == pytest.approx(1.0, abs=1e-4)
 
 
 def test_leaves_a_point_whose_way_is_blocked_for_one_that_can_be_moved() -> None:
@@ -139,7 +144,9 @@ def test_leaves_a_point_whose_way_is_blocked_for_one_that_can_be_moved() -> None
     flow = torch.cat([hinge_flow(points), torch.zeros(1, 40, 3)], dim=1)
     free, _, _ = choose(points, hinge_flow(points), near=0.0)
     contact, _, _ = choose(cloud, flow, near=0.0)
-    assert contact[0, 1] > free[0, 1] + 0.1, "nearer to the hinge than without the post"
+    assert on(points, free) and on(points, contact) and contact[0, 1] > free[0, 1] + 0.1, (
+        "nearer to the hinge than without the post"
+    )
 
 
 def test_of_points_that_move_alike_the_one_near_the_hand_is_chosen_but_no_near_one_that_moves_less() -> None:

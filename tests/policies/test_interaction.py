@@ -314,7 +314,7 @@ def rounds(
         while True:
             workers.update_policy_weights_()
             episodes = sorted(workers.run(trials), key=lambda episode: episode.index)
-            assert not any(episode.error for episode in episodes), episodes[0].error
+            assert [episode.error for episode in episodes] == [""] * len(trials)
             yield [episode.frames for episode in episodes if episode.frames is not None]
 
 
