@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.flow.rigid_motion import rigid_motion, screw
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
@@ -41,7 +42,6 @@ class ContactOptions:
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
         clearance: where that cylinder starts, in front of the point, m.
         reach: where that cylinder ends, m.
-        hand_length: from the tip to the hand's far end, m.
         run_up: straight way (m) that the tip needs above the ground before it touches.
         weak_flow: share of the largest flow that does if no point with more can be moved freely.
         candidates: points whose way along the flow is checked.
@@ -60,7 +60,6 @@ class ContactOptions:
     hand_radius: float = 0.05
     clearance: float = 0.06
     reach: float = 0.6
-    hand_length: float = 0.15
     run_up: float = 0.1
     weak_flow: float = 0.1
     candidates: int = 64
@@ -223,7 +222,7 @@ def _blocked(
 
 def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
     """Whether the hand's far end would come from below the ground z = 0, [B, N] bool."""
-    return points[..., 2] + (options.run_up + options.hand_length) * standoff[..., 2] < 0
+    return points[..., 2] + (options.run_up + HAND_LENGTH) * standoff[..., 2] < 0
 
 
 def _clear(
@@ -257,7 +256,7 @@ def _clear(
     turn, shift = screw(velocity[:, None, None], omega[:, None, None], time[..., None] * share)  # [B, K, steps, 3, 3]
     arm, away = (contact - centre[:, None])[:, :, None, :, None], away[:, :, None, :, None]
     at = (turn @ arm).squeeze(-1) + shift + centre[:, None, None]
-    reach = torch.linspace(options.clearance, options.hand_length, 3, device=points.device)
+    reach = torch.linspace(options.clearance, HAND_LENGTH, 3, device=points.device)
     hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
     meets = torch.stack(
         [

@@ -16,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
@@ -54,7 +55,6 @@ class FlowPolicyOptions:
         nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
         lead: how far ahead (s) of the observation the flow is read along the part's motion: half a control step, so
             that the tip moves on the chord of its arc and does not drift outwards.
-        hand_length: from the tip to the hand's far end, m.
         clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
             between itself and the ground z = 0.
         funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
@@ -77,7 +77,6 @@ class FlowPolicyOptions:
     retry_distance: float = 0.08
     nearby: float = 0.1
     lead: float = 0.025
-    hand_length: float = 0.2
     clearance: float = 0.08
     funnel: float = 0.5
     free: float = 0.08
@@ -417,7 +416,7 @@ class FlowPolicy(TensorDictModuleBase):
 
     def _above_ground(self, axis: Vector, tip: Vector) -> Vector:
         """Lift a unit hand axis that would take the hand's far end below ``clearance``."""
-        lowest = min(max((self.options.clearance - tip[2]) / self.options.hand_length, -1.0), 0.9)
+        lowest = min(max((self.options.clearance - tip[2]) / HAND_LENGTH, -1.0), 0.9)
         if axis[2] >= lowest:
             return axis
         return np.append(normalize(axis[:2]) * math.sqrt(1.0 - lowest**2), lowest)

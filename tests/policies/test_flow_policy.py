@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
 from fb3d_rl.models.artflownet import ArtFlowNet
@@ -190,11 +190,11 @@ def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, floa
 
 
 def test_the_hand_is_kept_above_the_ground() -> None:
-    policy = expert_policy(LIMITS, replace(FlowPolicyOptions(), clearance=0.08, hand_length=0.2))
+    policy = expert_policy(LIMITS, FlowPolicyOptions(clearance=0.08))
     down, tip = np.array([-0.1, 0.0, -0.995]), np.array([0.0, 0.0, 0.1])
     lifted = policy._above_ground(down, tip)
     assert np.linalg.norm(lifted) == pytest.approx(1.0, abs=1e-3)
-    assert tip[2] + 0.2 * lifted[2] >= 0.08 - 1e-6
+    assert tip[2] + HAND_LENGTH * lifted[2] == pytest.approx(0.08), "the far end of the gripper's own hand"
     assert np.array_equal(policy._above_ground(-down, tip), -down)
 
 
