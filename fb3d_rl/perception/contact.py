@@ -39,6 +39,8 @@ class ContactOptions:
             0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
         turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
         facing: cosine between flow and surface normal below which the hand approaches along the normal.
+        collisions: whether the hand's way to the point, and with the part from there, has to be free of the cloud and
+            the ground. Without it the supplement's rule is left: what is flat is good.
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
         clearance: where that cylinder starts, in front of the point, m.
         reach: where that cylinder ends, m.
@@ -57,6 +59,7 @@ class ContactOptions:
     near: float = 10.0
     turning: float = 1.0
     facing: float = 0.35
+    collisions: bool = True
     hand_radius: float = 0.05
     clearance: float = 0.06
     reach: float = 0.6
@@ -114,9 +117,9 @@ def choose_contact(
         nothing = torch.zeros_like(camera)
         return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
     points, valid, part, flow, avoid, norm = (x[:, moving] for x in (points, valid, part, flow, avoid, norm))
-    weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
-    movable = weak & (norm >= options.min_flow * largest)
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
+    weak = on_part & (norm >= options.weak_flow * largest)
+    movable = weak & (norm >= options.min_flow * largest)
     squared = squared_distances(points, cloud)
     among = squared[:, :, moving].masked_fill_(~on_part[:, None], torch.inf)
     nearest = among.topk(min(options.neighbors, len(moving)), largest=False)  # as knn finds them
@@ -125,10 +128,13 @@ def choose_contact(
     along = (direction * normals).sum(-1, keepdim=True)
     sight = normalize(camera[:, None] - points)
     usual = torch.where(along >= options.facing, direction, normals)
-    usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+    if options.collisions:
+        usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+        as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
+    else:
+        as_usual = torch.ones_like(weak)
 
     # The first free way; the usual one where none is.
-    as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
     free, standoff = as_usual, usual
     for way in (normals, sight):
         todo = (weak & ~free).any(0).nonzero().flatten()
@@ -145,7 +151,9 @@ def choose_contact(
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
     reachable = weak & smooth & fresh & free
-    clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
+    clear = reachable
+    if options.collisions:
+        clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
 
     tiers = [
         movable & smooth & as_usual & fresh & clear,

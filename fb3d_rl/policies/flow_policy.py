@@ -53,6 +53,8 @@ class FlowPolicyOptions:
         stuck_time: ... for longer (s) than this: the hand tears itself off and tries elsewhere.
         release_time: how long (s) it tries to tear itself off before it pulls on.
         fade: share of the way behind it that still counts a twentieth of a second later where it has to go back.
+        retries: how often it chooses another contact point after it has missed one or lost hold; then it stays where it
+            is. None: as often as there is time.
         retry_distance: points nearer (m) than this to a point tried in vain are not tried.
         nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
         lead: how far ahead of the observation the flow is read along the part's motion, as a share of a control step:
@@ -78,6 +80,7 @@ class FlowPolicyOptions:
     stuck_time: float = 0.3
     release_time: float = 0.9
     fade: float = 0.8
+    retries: int | None = None
     retry_distance: float = 0.08
     nearby: float = 0.1
     lead: float = 0.5
@@ -103,6 +106,7 @@ class Memory:
         came: where the tip came from, m, faded.
         tried: the last ``TRIES`` points that were tried in vain, m.
         tries: how many that were.
+        chosen: how many contact points it has set out for.
         candidates: points that would have done as well as the chosen one when it was chosen
             (:func:`~fb3d_rl.perception.contact.choose_contact`).
     """
@@ -117,6 +121,7 @@ class Memory:
     came: Vector
     tried: np.ndarray
     tries: int
+    chosen: int
     candidates: np.ndarray
 
     def give_up(self, point: Vector) -> None:
@@ -149,6 +154,7 @@ class FlowPolicy(TensorDictModuleBase):
         "came": ((3,), torch.float32),
         "tried": ((TRIES, 3), torch.float32),
         "tries": ((1,), torch.int64),
+        "chosen": ((1,), torch.int64),
         "candidates": ((CANDIDATES, CANDIDATE), torch.float32),
     }
 
@@ -247,7 +253,7 @@ class FlowPolicy(TensorDictModuleBase):
             if not attached:
                 # It backs off from where it is, not from a contact point that is far away.
                 m.phase, m.leave, m.contact_point, m.standoff = RETREAT, m.standoff, tip, hand
-            elif m.idle > self._stuck:
+            elif m.idle > self._stuck and self._tries_on(m):
                 m.give_up(tip)
                 m.phase, m.leave, m.idle = RELEASE, _across(hand, m.pull), 0
         elif m.phase == RETREAT:
@@ -261,10 +267,16 @@ class FlowPolicy(TensorDictModuleBase):
             if m.idle > self._release:  # it does not come off: pull on
                 m.phase, m.idle = PULL, 0
 
+        if m.phase == RETREAT and not self._tries_on(m):
+            m.phase, m.standoff = SELECT, hand  # and there it stays
         if attached and m.phase not in (PULL, RELEASE):
             if m.phase != APPROACH:  # held by chance, from another side than chosen
                 m.standoff = hand
             m.phase = PULL
+
+    def _tries_on(self, memory: Memory) -> bool:
+        """Whether it may choose a contact point (again)."""
+        return self.options.retries is None or memory.chosen <= self.options.retries
 
     def choose_again(self, state: TensorDictBase, obs: TensorDictBase, where: Tensor) -> None:
         """Send the hand, on its way to a part that nothing has moved, to what is the best candidate from where it is.
@@ -296,6 +308,7 @@ class FlowPolicy(TensorDictModuleBase):
         contact, pull, standoff, candidates = chosen
         state.update({"contact_point": contact, "pull": pull, "standoff": standoff, "candidates": candidates})
         state["phase"] = torch.full_like(state["phase"], TRAVEL)
+        state["chosen"] = torch.ones_like(state["chosen"])
         state["idle"] = torch.zeros_like(state["idle"])
         state["leave"] = torch.zeros_like(state["leave"])
         state["tip"] = obs["tool_pose"][..., :3].clone()  # nothing was remembered of where it came from
@@ -303,7 +316,7 @@ class FlowPolicy(TensorDictModuleBase):
 
     def _choose(self, memories: list[Memory], obs: TensorDictBase, axis: Tensor, flow: Tensor) -> None:
         """Choose a contact point in the environments that are about to, and send them there."""
-        rows = _in_phase(memories, SELECT)
+        rows = [i for i in _in_phase(memories, SELECT) if self._tries_on(memories[i])]
         if not rows:
             return
         tip = obs["tool_pose"][..., :3]
@@ -321,7 +334,7 @@ class FlowPolicy(TensorDictModuleBase):
             memory = memories[i]
             memory.contact_point, memory.pull, memory.standoff, memory.candidates = found
             if memory.pull.any():
-                memory.phase = TRAVEL
+                memory.phase, memory.chosen = TRAVEL, memory.chosen + 1
 
     def _path_velocity(self, memory: Memory, tip: Vector) -> Vector:
         """Tip velocity (m/s) of the phases APPROACH, RETREAT and RELEASE; 0 while no contact point can be chosen."""

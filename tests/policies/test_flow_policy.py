@@ -377,3 +377,41 @@ def test_a_door_is_opened_at_any_frequency(frequency: int) -> None:
     rollout(door, expert_policy(VelocityLimits(2.0, 3.0, period)), until=1.4, steps=round(7.5 / period))
     assert door.opened >= 1.4
     assert float((door.tip() - door.points()[door.held]).norm()) < 0.03, "no drift off the held point"
+
+
+@pytest.mark.parametrize("retries", [None, 0, 1])
+def test_after_its_last_retry_the_hand_stays_where_it_lost_hold(retries: int | None) -> None:
+    policy, door = expert_policy(LIMITS, FlowPolicyOptions(retries=retries)), ToyDoor()
+    state, held, losses = policy.initial_state((1,)), False, 0
+    for _ in range(200):
+        td = policy(door.observe(state))
+        state = td["next", "policy"]
+        door.step(td["action"])
+        losses += held and door.held is None
+        if door.held is not None and int(state["phase"]) == PULL and door.opened > 0.1:
+            door.held = None  # it never holds for long
+            losses += 1
+            door.opened = 0.05
+    if retries is None:
+        assert losses > 2
+        return
+    assert losses == retries + 1
+    assert int(state["phase"]) == SELECT and torch.allclose(td["action"], torch.zeros(1, 8), atol=1e-6)
+
+
+def test_without_retries_a_stuck_hand_pulls_on_and_a_failed_touch_is_the_last() -> None:
+    policy, door = expert_policy(LIMITS, FlowPolicyOptions(retries=0)), ToyDoor(sliding=True)
+    state = policy(door.observe(policy.initial_state((1,))))["next", "policy"]
+    state["phase"], state["pull"] = torch.full((1, 1), PULL), torch.tensor([[-1.0, 0.0, 0.0]])
+    held = door.observe(state)
+    held["observation", "attached"] = torch.ones(1, 1, dtype=torch.bool)
+    for _ in range(20):
+        held["policy"] = policy(held)["next", "policy"]
+    assert int(held["policy", "phase"]) == PULL
+    pressing = door.observe(state.clone())
+    pressing["policy", "phase"] = torch.full((1, 1), APPROACH)
+    pressing["policy", "contact_point"] = door.tip()
+    pressing["observation", "contact_force"] = torch.full((1, 1), 100.0)
+    for _ in range(10):
+        pressing["policy"] = policy(pressing)["next", "policy"]
+    assert int(pressing["policy", "phase"]) == SELECT
