@@ -255,7 +255,7 @@ class EnvConfig:
 
 @dataclass
 class FlowConfig:
-    """Part of fb3d_rl.policies.flow_policy.FlowPolicyOptions."""
+    """fb3d_rl.policies.flow_policy.FlowPolicyOptions."""
 
     travel_speed: float
     approach_speed: float
@@ -263,16 +263,46 @@ class FlowConfig:
     pull_speed: float
     angular_gain: float
     precontact: float
+    line: float
+    overshoot: float
     force: float
+    patience: float
+    stuck_speed: float
+    stuck_time: float
+    release_time: float
+    fade: float
+    retries: int | None
+    retry_distance: float
+    nearby: float
+    lead: float
+    clearance: float
+    funnel: float
+    free: float
+    margin: float
 
 
 @dataclass
 class ContactConfig:
-    """Part of fb3d_rl.perception.contact.ContactOptions."""
+    """fb3d_rl.perception.contact.ContactOptions."""
 
+    neighbors: int
     curvature: float
+    rim: float
     min_distance: float
+    min_flow: float
+    near: float
+    turning: float
     facing: float
+    collisions: bool
+    hand_radius: float
+    clearance: float
+    reach: float
+    run_up: float
+    weak_flow: float
+    candidates: int
+    sweep: float
+    sweep_angle: float
+    sweep_steps: int
 
 
 @dataclass
@@ -416,6 +446,7 @@ def validate(cfg: CommandConfig) -> None:
     """
     _one_of("assets.source", cfg.assets.source, ("procedural", "partnet_mobility"))
     _one_of("policy.name", cfg.policy.name, UNTRAINED + TRAINED)
+    _validate_policy(cfg.policy)
     _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
     _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
     _at_least("collector.restarts", cfg.collector.restarts, 0)
@@ -481,6 +512,35 @@ def validate(cfg: CommandConfig) -> None:
             raise UserError(
                 "assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR"
             )
+
+
+def _validate_policy(policy: PolicyConfig) -> None:
+    flow, contact = policy.flow, policy.contact
+    for key in ("travel_speed", "approach_speed", "touch_speed", "pull_speed", "angular_gain", "precontact", "line",
+                "overshoot", "nearby"):  # fmt: skip
+        _positive(f"policy.flow.{key}", getattr(flow, key))
+    for key in ("force", "patience", "stuck_speed", "stuck_time", "release_time", "retry_distance", "lead", "clearance",
+                "funnel", "free", "margin"):  # fmt: skip
+        _at_least(f"policy.flow.{key}", getattr(flow, key), 0)
+    if flow.retries is not None:
+        _at_least("policy.flow.retries", flow.retries, 0)
+    for key in ("curvature", "rim", "min_distance", "near", "turning", "hand_radius", "clearance", "run_up"):
+        _at_least(f"policy.contact.{key}", getattr(contact, key), 0)
+    for key in ("reach", "sweep", "sweep_angle"):
+        _positive(f"policy.contact.{key}", getattr(contact, key))
+    for key, least in (("neighbors", 3), ("candidates", 1), ("sweep_steps", 1)):
+        _at_least(f"policy.contact.{key}", getattr(contact, key), least)
+    if contact.reach <= contact.clearance:
+        raise UserError(
+            f"policy.contact.reach={contact.reach} is where the hand's cylinder ends; give more than "
+            f"policy.contact.clearance={contact.clearance}, where it starts"
+        )
+    shares = {"flow.fade": flow.fade, "contact.min_flow": contact.min_flow, "contact.weak_flow": contact.weak_flow}
+    for key, value in shares.items():
+        if not 0 <= value <= 1:
+            raise UserError(f"policy.{key}={value} is no share; give a number from 0 to 1")
+    if not -1 <= contact.facing <= 1:
+        raise UserError(f"policy.contact.facing={contact.facing} is no cosine; give a number from -1 to 1")
 
 
 def _validate_artflownet(algo: ArtFlowNetConfig) -> None:

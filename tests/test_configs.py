@@ -321,6 +321,12 @@ def test_defaults_are_the_librarys(name: str) -> None:
     assert not different, f"{name}: (configured, library's default) differ: {different}"
 
 
+def test_every_option_of_the_flow_policy_can_be_set() -> None:
+    content: Any = OmegaConf.to_container(OmegaConf.load(CONF / "policy/flow.yaml"))
+    assert set(content["flow"]) == {f.name for f in dataclasses.fields(FlowPolicyOptions)} - {"contact", "mask"}
+    assert set(content["contact"]) == {f.name for f in dataclasses.fields(ContactOptions)}
+
+
 @pytest.mark.parametrize(
     ("override", "word"),
     [
@@ -344,6 +350,14 @@ def test_defaults_are_the_librarys(name: str) -> None:
         ("evaluation.trials=-1", "evaluation.trials"),
         ("env.suction.hold=all", "env.suction.hold"),
         ("policy=expert", "policy.name"),
+        ("policy.flow.retries=-1", "policy.flow.retries"),
+        ("policy.flow.pull_speed=0", "policy.flow.pull_speed"),
+        ("policy.flow.patience=-0.1", "policy.flow.patience"),
+        ("policy.flow.fade=2", "policy.flow.fade"),
+        ("policy.contact.min_flow=1.5", "policy.contact.min_flow"),
+        ("policy.contact.neighbors=2", "policy.contact.neighbors"),
+        ("policy.contact.facing=2", "policy.contact.facing"),
+        ("policy.contact.reach=0.05", "policy.contact.clearance"),
         ("assets.source=shapenet", "assets.source"),
         ("assets=partnet_mobility", "assets.root"),
     ],

@@ -27,8 +27,8 @@ from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.rollout import create_env, state_of
 from fb3d_rl.evaluation.trials import draw_trials
 
-EVERY = 4
-"""Frames from one that is kept to the next: a fifth of a second apart, neighbours are nearly alike."""
+EVERY = 0.2
+"""Time (s) from one frame that is kept to the next: sooner they are nearly alike."""
 
 KEYS: tuple[Key, ...] = (
     *(("observation", key) for key in ("points", "valid", "part_mask")),
@@ -73,6 +73,7 @@ def meet_samples(
     number = {obj.id: index for index, obj in enumerate(objects)}
     rng = np.random.default_rng([protocol.seed, 6])
     create = partial(create_env, tuple(objects), protocol.env, state_of(policy))
+    every = max(1, round(EVERY * protocol.env.control_freq))
     filled = 0
     with Workers(create, policy, protocol.collector, protocol.env.horizon) as workers:
         while filled < count:
@@ -83,7 +84,7 @@ def meet_samples(
                 episode = frames[index]
                 if episode is None:
                     continue
-                seen = episode[::EVERY]
+                seen = episode[::every]
                 seen = seen[seen["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5][: count - filled]
                 part = slice(filled, filled + len(seen))
                 owner, size = number[trial.object], [len(seen)]

@@ -326,7 +326,8 @@ def load_policy(path: str | Path, expert: FlowPolicy) -> tuple[str, TensorDictMo
         expert: the oracle that drives to the contact point, if the learner was trained beside one.
 
     Raises:
-        UserError: the file is missing or no such checkpoint.
+        UserError: the file is missing or no such checkpoint, or its learner was trained on a gripper to which an action
+            means something else: what it remembers and plans is counted in control steps.
     """
     content = load_checkpoint(path)
     if content["algo"] not in ALGOS:
@@ -337,6 +338,11 @@ def load_policy(path: str | Path, expert: FlowPolicy) -> tuple[str, TensorDictMo
         flow_net = ArtFlowNet(**kwargs["flow_net"])
         flow_net.load_state_dict(state["flow_model"])
     limits = VelocityLimits(**kwargs["limits"])
+    if limits != expert.limits:
+        raise UserError(
+            f"{path} was trained with env.gripper.v_max={limits.linear:g} env.gripper.w_max={limits.angular:g} "
+            f"env.control_freq={1 / limits.period:g}; give the same"
+        )
     learner = new_learner(LearnerOptions(**kwargs["options"]), limits, kwargs["members"], 0, flow_net)
     networks(learner).load_state_dict(state["model"])
     return kwargs["name"], acting_policy(expert, learner, kwargs["oracle"])

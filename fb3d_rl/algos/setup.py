@@ -23,6 +23,7 @@ from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOption
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.rollout import limits_of
 from fb3d_rl.evaluation.trials import ScheduleOptions
 from fb3d_rl.evaluation.video import require_encoder
 from fb3d_rl.perception.contact import ContactOptions
@@ -160,9 +161,8 @@ def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
 
 
 def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
-    """What action 1 means for the gripper."""
-    gripper = env_options(cfg).gripper
-    return VelocityLimits(gripper.v_max, gripper.w_max)
+    """What an action means for the gripper."""
+    return limits_of(env_options(cfg))
 
 
 def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:

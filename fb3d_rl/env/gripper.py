@@ -2,33 +2,20 @@
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import trimesh
-from defusedxml import ElementTree
 from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.controllers import PDJointVelControllerConfig
 from mani_skill.agents.registration import register_agent
 from torch import Tensor
 
-from fb3d_rl.assets.articulation import Mesh
+from fb3d_rl.assets.gripper import TOOL, URDF
 from fb3d_rl.env.options import GripperOptions
 
 JOINTS = ("x", "y", "z", "roll", "pitch", "yaw", "finger_left", "finger_right")
 """Joints in the order of actions, qpos and qvel."""
-
-FINGERS = ("finger_left", "finger_right")
-"""Links whose ends form the suction tip."""
-
-BODIES = ("hand", *FINGERS)
-"""Links that have a shape."""
-
-TOOL = "tool"
-"""Link at the suction tip, 0.12 m from the hand's origin along the tool axis, the hand's +x."""
 
 
 @register_agent()
@@ -41,7 +28,7 @@ class FloatingSuctionGripper(BaseAgent):
     """
 
     uid = "floating_suction_gripper"
-    urdf_path = str(Path(__file__).with_name("gripper.urdf"))
+    urdf_path = str(URDF)
     disable_self_collisions = True
     _builder: ClassVar[Any] = None
 
@@ -81,19 +68,3 @@ class FloatingSuctionGripper(BaseAgent):
         rows = np.array([np.concatenate([pose.p, pose.q]) for pose in poses], dtype=np.float32)
         rows[rows[:, 3] < 0, 3:] *= -1.0
         return torch.from_numpy(rows).to(self.device)
-
-
-@cache
-def gripper_meshes() -> tuple[tuple[Mesh, ...], ...]:
-    """The shapes of ``BODIES``, for cameras: the URDF's boxes, each in its link's frame (m)."""
-    links = {link.get("name"): link for link in ElementTree.parse(FloatingSuctionGripper.urdf_path).iter("link")}
-    return tuple(tuple(_box(shape) for shape in links[name].iter("collision")) for name in BODIES)
-
-
-def _box(collision: Any) -> Mesh:
-    size, centre = (
-        np.array([float(word) for word in collision.find(path).get(name).split()])
-        for path, name in (("geometry/box", "size"), ("origin", "xyz"))
-    )
-    box = trimesh.creation.box(extents=size)
-    return Mesh(np.asarray(box.vertices) + centre, np.asarray(box.faces, dtype=np.int64))

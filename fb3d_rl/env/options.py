@@ -15,9 +15,6 @@ from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.contract import UserError
 from fb3d_rl.flow.opening import openable_links, opening_range, start_fraction
 
-TIP = 0.12
-"""How far (m) the suction tip is in front of the hand's origin, along the hand's x axis."""
-
 
 @dataclass(frozen=True)
 class GripperOptions:

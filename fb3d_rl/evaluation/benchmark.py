@@ -29,11 +29,10 @@ from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions, Workers
-from fb3d_rl.evaluation.rollout import create_env, policy_env, run_trials, state_of
+from fb3d_rl.evaluation.rollout import create_env, limits_of, policy_env, run_trials, state_of
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.trials import Scheduled
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
-from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 
 Progress = Callable[[str], None]
@@ -144,7 +143,7 @@ def _ratios(over: Sequence[float], under: Sequence[float]) -> list[float]:
 
 
 def _expert(options: EnvOptions) -> FlowPolicy:
-    return expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
+    return expert_policy(limits_of(options))
 
 
 def _stock_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> tuple[Any, str]:

@@ -24,10 +24,9 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers
 from fb3d_rl.evaluation.film import Film, record
-from fb3d_rl.evaluation.rollout import create_env, state_of
+from fb3d_rl.evaluation.rollout import create_env, limits_of, state_of
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.policies.flow_policy import expert_policy
-from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 
 KEYS: tuple[Key, ...] = (
@@ -135,7 +134,7 @@ def record_expert(
         successful: leave out episodes without success.
         progress: called with each episode that was run and whether it is kept.
     """
-    expert = expert_policy(VelocityLimits(options.gripper.v_max, options.gripper.w_max))
+    expert = expert_policy(limits_of(options))
     policy = InteractivePolicy(expert, None, BetaGate())
     create = partial(create_env, tuple(objects), options, state_of(policy))
     waiting: dict[int, Episode] = {}

@@ -33,6 +33,7 @@ from fb3d_rl.evaluation.rows import (
 from fb3d_rl.evaluation.trials import Scheduled, trial_key
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.hand import VelocityLimits
 
 KEYS: tuple[Key, ...] = (
     ("observation", "tool_pose"),
@@ -56,6 +57,11 @@ def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
     start = TensorDict({"policy": FlowPolicy.initial_state(one)}, batch_size=one)
     further = None if isinstance(policy, FlowPolicy) else getattr(policy, "initial_state", None)
     return start if further is None else start.update(further(one))
+
+
+def limits_of(options: EnvOptions) -> VelocityLimits:
+    """What an action means to the gripper of a task."""
+    return VelocityLimits(options.gripper.v_max, options.gripper.w_max, 1.0 / options.control_freq)
 
 
 def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:

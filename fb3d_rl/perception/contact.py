@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.flow.rigid_motion import rigid_motion, screw
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
@@ -38,10 +39,11 @@ class ContactOptions:
             0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
         turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
         facing: cosine between flow and surface normal below which the hand approaches along the normal.
+        collisions: whether the hand's way to the point, and with the part from there, has to be free of the cloud and
+            the ground. Without it the supplement's rule is left: what is flat is good.
         hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
         clearance: where that cylinder starts, in front of the point, m.
         reach: where that cylinder ends, m.
-        hand_length: from the tip to the hand's far end, m.
         run_up: straight way (m) that the tip needs above the ground before it touches.
         weak_flow: share of the largest flow that does if no point with more can be moved freely.
         candidates: points whose way along the flow is checked.
@@ -57,10 +59,10 @@ class ContactOptions:
     near: float = 10.0
     turning: float = 1.0
     facing: float = 0.35
+    collisions: bool = True
     hand_radius: float = 0.05
     clearance: float = 0.06
     reach: float = 0.6
-    hand_length: float = 0.15
     run_up: float = 0.1
     weak_flow: float = 0.1
     candidates: int = 64
@@ -115,9 +117,9 @@ def choose_contact(
         nothing = torch.zeros_like(camera)
         return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
     points, valid, part, flow, avoid, norm = (x[:, moving] for x in (points, valid, part, flow, avoid, norm))
-    weak = valid & (norm >= options.weak_flow * largest) & (largest > 0)
-    movable = weak & (norm >= options.min_flow * largest)
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
+    weak = on_part & (norm >= options.weak_flow * largest)
+    movable = weak & (norm >= options.min_flow * largest)
     squared = squared_distances(points, cloud)
     among = squared[:, :, moving].masked_fill_(~on_part[:, None], torch.inf)
     nearest = among.topk(min(options.neighbors, len(moving)), largest=False)  # as knn finds them
@@ -126,10 +128,13 @@ def choose_contact(
     along = (direction * normals).sum(-1, keepdim=True)
     sight = normalize(camera[:, None] - points)
     usual = torch.where(along >= options.facing, direction, normals)
-    usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+    if options.collisions:
+        usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+        as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
+    else:
+        as_usual = torch.ones_like(weak)
 
     # The first free way; the usual one where none is.
-    as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
     free, standoff = as_usual, usual
     for way in (normals, sight):
         todo = (weak & ~free).any(0).nonzero().flatten()
@@ -146,7 +151,9 @@ def choose_contact(
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
     reachable = weak & smooth & fresh & free
-    clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
+    clear = reachable
+    if options.collisions:
+        clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
 
     tiers = [
         movable & smooth & as_usual & fresh & clear,
@@ -223,7 +230,7 @@ def _blocked(
 
 def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
     """Whether the hand's far end would come from below the ground z = 0, [B, N] bool."""
-    return points[..., 2] + (options.run_up + options.hand_length) * standoff[..., 2] < 0
+    return points[..., 2] + (options.run_up + HAND_LENGTH) * standoff[..., 2] < 0
 
 
 def _clear(
@@ -257,7 +264,7 @@ def _clear(
     turn, shift = screw(velocity[:, None, None], omega[:, None, None], time[..., None] * share)  # [B, K, steps, 3, 3]
     arm, away = (contact - centre[:, None])[:, :, None, :, None], away[:, :, None, :, None]
     at = (turn @ arm).squeeze(-1) + shift + centre[:, None, None]
-    reach = torch.linspace(options.clearance, options.hand_length, 3, device=points.device)
+    reach = torch.linspace(options.clearance, HAND_LENGTH, 3, device=points.device)
     hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
     meets = torch.stack(
         [

@@ -16,6 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.flow.rigid_motion import rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
@@ -35,7 +36,7 @@ TRIES = 6
 
 @dataclass(frozen=True)
 class FlowPolicyOptions:
-    """Speeds, gains and distances of the flow policy.
+    """Speeds, gains, distances and times of the flow policy.
 
     Attributes:
         travel_speed: of the tip around the object, m/s.
@@ -47,14 +48,17 @@ class FlowPolicyOptions:
         line: how far (m) off the approach line the tip may be when it turns to the contact point.
         overshoot: how far (m) the tip may pass the contact point before the approach has failed.
         force: contact force (N) that ends an approach which does not hold.
-        patience: control steps for which that force is borne, since suction may still engage.
-        stuck_progress: a pull is stuck if the tip moves less (m) along the flow in a control step ...
-        stuck_steps: ... for more control steps than this: the hand tears itself off and tries elsewhere.
+        patience: how long (s) that force is borne, since suction may still engage.
+        stuck_speed: a pull is stuck if the tip moves slower (m/s) along the flow than this ...
+        stuck_time: ... for longer (s) than this: the hand tears itself off and tries elsewhere.
+        release_time: how long (s) it tries to tear itself off before it pulls on.
+        fade: share of the way behind it that still counts a twentieth of a second later where it has to go back.
+        retries: how often it chooses another contact point after it has missed one or lost hold; then it stays where it
+            is. None: as often as there is time.
         retry_distance: points nearer (m) than this to a point tried in vain are not tried.
         nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
-        lead: how far ahead (s) of the observation the flow is read along the part's motion: half a control step, so
-            that the tip moves on the chord of its arc and does not drift outwards.
-        hand_length: from the tip to the hand's far end, m.
+        lead: how far ahead of the observation the flow is read along the part's motion, as a share of a control step:
+            half of it, so that the tip moves on the chord of its arc and does not drift outwards.
         clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
             between itself and the ground z = 0.
         funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
@@ -71,13 +75,15 @@ class FlowPolicyOptions:
     line: float = 0.06
     overshoot: float = 0.08
     force: float = 20.0
-    patience: int = 4
-    stuck_progress: float = 0.004
-    stuck_steps: int = 6
+    patience: float = 0.2
+    stuck_speed: float = 0.08
+    stuck_time: float = 0.3
+    release_time: float = 0.9
+    fade: float = 0.8
+    retries: int | None = None
     retry_distance: float = 0.08
     nearby: float = 0.1
-    lead: float = 0.025
-    hand_length: float = 0.2
+    lead: float = 0.5
     clearance: float = 0.08
     funnel: float = 0.5
     free: float = 0.08
@@ -100,6 +106,7 @@ class Memory:
         came: where the tip came from, m, faded.
         tried: the last ``TRIES`` points that were tried in vain, m.
         tries: how many that were.
+        chosen: how many contact points it has set out for.
         candidates: points that would have done as well as the chosen one when it was chosen
             (:func:`~fb3d_rl.perception.contact.choose_contact`).
     """
@@ -114,6 +121,7 @@ class Memory:
     came: Vector
     tried: np.ndarray
     tries: int
+    chosen: int
     candidates: np.ndarray
 
     def give_up(self, point: Vector) -> None:
@@ -128,8 +136,8 @@ class FlowPolicy(TensorDictModuleBase):
     Args:
         flow_key: where the flow is read: ``("privileged", "flow")`` makes the expert, ``("prediction", "flow")``
             FlowBot3D.
-        limits: the gripper's velocity limits.
-        options: speeds, gains and distances.
+        limits: what an action means.
+        options: speeds, gains, distances and times.
 
     Shapes: reads the contract's "observation" group and the flow [E, N, 3]; writes ``action`` [E, 8] and the next
     step's state under ``("next", "policy")``, whose layout :meth:`initial_state` gives.
@@ -146,6 +154,7 @@ class FlowPolicy(TensorDictModuleBase):
         "came": ((3,), torch.float32),
         "tried": ((TRIES, 3), torch.float32),
         "tries": ((1,), torch.int64),
+        "chosen": ((1,), torch.int64),
         "candidates": ((CANDIDATES, CANDIDATE), torch.float32),
     }
 
@@ -156,6 +165,12 @@ class FlowPolicy(TensorDictModuleBase):
         self.flow_key = flow_key
         self.limits = limits
         self.options = options or FlowPolicyOptions()
+        o, self._period = self.options, limits.period
+        self._patience, self._stuck, self._release = (
+            round(time / self._period) for time in (o.patience, o.stuck_time, o.release_time)
+        )
+        self._still = o.stuck_speed * self._period
+        self._fade = o.fade ** (self._period / 0.05)
         observed = ("points", "valid", "part_mask", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
         self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
         self.in_keys += [("policy", key) for key in self.STATE]
@@ -198,7 +213,7 @@ class FlowPolicy(TensorDictModuleBase):
             else:
                 velocity = self._path_velocity(memory, tip)
             wanted = self._above_ground(memory.standoff, tip)
-            twists[i, :3], twists[i, 3:] = velocity, self.options.angular_gain * alignment(hand, wanted)
+            twists[i, :3], twists[i, 3:] = velocity, self._gain(self.options.angular_gain) * alignment(hand, wanted)
         twist = torch.from_numpy(twists).to(axis)
         tensordict["action"] = joint_velocities(obs, axis, twist[:, :3], twist[:, 3:], self.limits)
         tensordict["next", "policy"] = self._state(memories, tensordict.device)
@@ -211,14 +226,14 @@ class FlowPolicy(TensorDictModuleBase):
         m.tip, m.came = tip, np.zeros(3)
         offset = tip - m.contact_point
         height = float(offset @ m.standoff)
-        halted = touches and length(moved) < o.stuck_progress
+        halted = touches and length(moved) < self._still
 
         if m.phase == SELECT:
             m.idle = 0
         elif m.phase == TRAVEL:
             m.idle = m.idle + 1 if halted else 0
-            m.came = 0.8 * came - moved
-            if m.idle > o.stuck_steps:  # something stands in the way that the cloud does not show
+            m.came = self._fade * came - moved
+            if m.idle > self._stuck:  # something stands in the way that the cloud does not show
                 m.give_up(m.contact_point)
                 m.leave = normalize(m.came)
                 m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
@@ -230,32 +245,38 @@ class FlowPolicy(TensorDictModuleBase):
                 m.phase = APPROACH
         elif m.phase == APPROACH:
             m.idle = m.idle + 1 if touches else 0
-            if not attached and (m.idle > o.patience or height < -o.overshoot):
+            if not attached and (m.idle > self._patience or height < -o.overshoot):
                 m.give_up(m.contact_point)
                 m.phase, m.leave = RETREAT, m.standoff
         elif m.phase == PULL:
-            m.idle = m.idle + 1 if attached and sense * (moved @ m.pull) < o.stuck_progress else 0
+            m.idle = m.idle + 1 if attached and sense * (moved @ m.pull) < self._still else 0
             if not attached:
                 # It backs off from where it is, not from a contact point that is far away.
                 m.phase, m.leave, m.contact_point, m.standoff = RETREAT, m.standoff, tip, hand
-            elif m.idle > o.stuck_steps:
+            elif m.idle > self._stuck and self._tries_on(m):
                 m.give_up(tip)
                 m.phase, m.leave, m.idle = RELEASE, _across(hand, m.pull), 0
         elif m.phase == RETREAT:
             m.idle = m.idle + 1 if halted else 0
-            if offset @ m.leave > o.precontact or m.idle > o.stuck_steps:
+            if offset @ m.leave > o.precontact or m.idle > self._stuck:
                 m.phase = SELECT
         elif m.phase == RELEASE:
             m.idle += 1
             if not attached:
                 m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
-            if m.idle > 3 * o.stuck_steps:  # it does not come off: pull on
+            if m.idle > self._release:  # it does not come off: pull on
                 m.phase, m.idle = PULL, 0
 
+        if m.phase == RETREAT and not self._tries_on(m):
+            m.phase, m.standoff = SELECT, hand  # and there it stays
         if attached and m.phase not in (PULL, RELEASE):
             if m.phase != APPROACH:  # held by chance, from another side than chosen
                 m.standoff = hand
             m.phase = PULL
+
+    def _tries_on(self, memory: Memory) -> bool:
+        """Whether it may choose a contact point (again)."""
+        return self.options.retries is None or memory.chosen <= self.options.retries
 
     def choose_again(self, state: TensorDictBase, obs: TensorDictBase, where: Tensor) -> None:
         """Send the hand, on its way to a part that nothing has moved, to what is the best candidate from where it is.
@@ -287,6 +308,7 @@ class FlowPolicy(TensorDictModuleBase):
         contact, pull, standoff, candidates = chosen
         state.update({"contact_point": contact, "pull": pull, "standoff": standoff, "candidates": candidates})
         state["phase"] = torch.full_like(state["phase"], TRAVEL)
+        state["chosen"] = torch.ones_like(state["chosen"])
         state["idle"] = torch.zeros_like(state["idle"])
         state["leave"] = torch.zeros_like(state["leave"])
         state["tip"] = obs["tool_pose"][..., :3].clone()  # nothing was remembered of where it came from
@@ -294,7 +316,7 @@ class FlowPolicy(TensorDictModuleBase):
 
     def _choose(self, memories: list[Memory], obs: TensorDictBase, axis: Tensor, flow: Tensor) -> None:
         """Choose a contact point in the environments that are about to, and send them there."""
-        rows = _in_phase(memories, SELECT)
+        rows = [i for i in _in_phase(memories, SELECT) if self._tries_on(memories[i])]
         if not rows:
             return
         tip = obs["tool_pose"][..., :3]
@@ -312,7 +334,7 @@ class FlowPolicy(TensorDictModuleBase):
             memory = memories[i]
             memory.contact_point, memory.pull, memory.standoff, memory.candidates = found
             if memory.pull.any():
-                memory.phase = TRAVEL
+                memory.phase, memory.chosen = TRAVEL, memory.chosen + 1
 
     def _path_velocity(self, memory: Memory, tip: Vector) -> Vector:
         """Tip velocity (m/s) of the phases APPROACH, RETREAT and RELEASE; 0 while no contact point can be chosen."""
@@ -321,8 +343,8 @@ class FlowPolicy(TensorDictModuleBase):
             offset = tip - memory.contact_point
             height = float(offset @ memory.standoff)
             sideways = offset - height * memory.standoff
-            speed = min(max(10.0 * (height - o.precontact), o.touch_speed), o.approach_speed)
-            return -speed * memory.standoff - 8.0 * sideways
+            speed = min(max(self._gain(10.0) * (height - o.precontact), o.touch_speed), o.approach_speed)
+            return -speed * memory.standoff - self._gain(8.0) * sideways
         if memory.phase == RETREAT:
             return o.approach_speed * memory.leave
         if memory.phase == RELEASE:
@@ -333,6 +355,10 @@ class FlowPolicy(TensorDictModuleBase):
         """The visible points [M, 3] of each environment on its way, m."""
         rows = _in_phase(memories, TRAVEL)
         return {i: _numbers(obs["points"][i][obs["valid"][i]]) for i in rows}
+
+    def _gain(self, wanted: float) -> float:
+        """The gain (1/s) with which an offset is made up for: at most all of it in one control step."""
+        return min(wanted, 1.0 / self._period)
 
     def _travel(self, memory: Memory, tip: Vector, cloud: np.ndarray) -> Vector:
         """Velocity to the approach line: straight into a funnel that narrows to the pre-contact point, if that is free.
@@ -378,7 +404,7 @@ class FlowPolicy(TensorDictModuleBase):
     def _straight(self, tip: Vector, goal: Vector) -> Vector:
         """Velocity to a goal, slower the last bit of the way."""
         way = goal - tip
-        return min(6.0 * length(way), self.options.travel_speed) * normalize(way)
+        return min(self._gain(6.0) * length(way), self.options.travel_speed) * normalize(way)
 
     def _in_the_way(self, cloud: np.ndarray, tip: Vector, goal: Vector) -> bool:
         """Whether the straight way brings the tip near to points of the cloud that it is not as near to already."""
@@ -411,13 +437,13 @@ class FlowPolicy(TensorDictModuleBase):
         for i, at_tip, omega in zip(rows, *map(_numbers, motion), strict=True):
             speed = length(at_tip)
             unit = normalize(at_tip)
-            rate = senses[i] * o.lead * o.pull_speed / max(speed, 1e-6) * omega
+            rate = senses[i] * o.lead * self._period * o.pull_speed / max(speed, 1e-6) * omega
             found[i] = normalize(unit + cross(rate, unit)) if speed > 1e-6 else memories[i].pull
         return found
 
     def _above_ground(self, axis: Vector, tip: Vector) -> Vector:
         """Lift a unit hand axis that would take the hand's far end below ``clearance``."""
-        lowest = min(max((self.options.clearance - tip[2]) / self.options.hand_length, -1.0), 0.9)
+        lowest = min(max((self.options.clearance - tip[2]) / HAND_LENGTH, -1.0), 0.9)
         if axis[2] >= lowest:
             return axis
         return np.append(normalize(axis[:2]) * math.sqrt(1.0 - lowest**2), lowest)

@@ -14,10 +14,11 @@ from fb3d_rl.geometry.transforms import euler_xyz_jacobian, normalize
 
 @dataclass(frozen=True)
 class VelocityLimits:
-    """What action 1 means: m/s, rad/s; has to be the gripper's."""
+    """What action 1 means, m/s and rad/s, and how long it lasts, s; has to be the gripper's."""
 
     linear: float
     angular: float
+    period: float = 0.05
 
 
 def hand_axis(tool_pose: Tensor) -> Tensor:

@@ -213,6 +213,9 @@ class InteractivePolicy(TensorDictModuleBase):
         if bool(away.any()):
             state["phase"] = torch.where(away, SELECT, phase)
             state["leave"] = torch.where(away, 0.0, state["leave"])
+        # What the learner misses or loses is none of the expert's own tries.
+        missed = looks_on & (state["phase"] == SELECT)
+        state["chosen"] = torch.where(missed, (state["chosen"] - 1).clamp_min(0), state["chosen"])
         on_the_way = looks_on & ((phase == TRAVEL) | (phase == APPROACH))
         if bool(on_the_way.any()):
             self.expert.choose_again(state, obs, on_the_way)

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
+from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.policies.hand import VelocityLimits
@@ -44,6 +45,10 @@ SMALL = [
     "evaluation.trials=1",
     "env.horizon=70",
 ]
+SMALL_EVAL = [
+    item for item in SMALL if item.startswith(("assets.", "data.", "camera.", "evaluation.", "env.", "experiment="))
+]
+"""What of it an evaluation has, too."""
 
 
 @pytest.fixture(scope="module")
@@ -119,10 +124,15 @@ def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Pat
 
 
 def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:
-    keep = ("assets.", "data.", "camera.", "evaluation.", "env.", "experiment=")
-    same = [item for item in SMALL if item.startswith(keep)]
-    run_evaluation(config("evaluate", [*same, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]), tmp_path)
+    run_evaluation(config("evaluate", [*SMALL_EVAL, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]), tmp_path)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+
+
+def test_a_learner_acts_only_where_actions_mean_what_it_was_taught(first: Path, tmp_path: Path, config: Config) -> None:
+    given = [*SMALL_EVAL, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]
+    for other in ("env.control_freq=10", "env.gripper.v_max=1.0"):
+        with pytest.raises(UserError, match=r"v_max=2 env.gripper.w_max=3 env.control_freq=20; give the same"):
+            run_evaluation(config("evaluate", [*given, other]), tmp_path)
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.gripper import BODIES, HAND_LENGTH, TIP
 from fb3d_rl.env.gripper import JOINTS
 from fb3d_rl.env.task import OpenArticulatedEnv
 from fb3d_rl.geometry.transforms import euler_xyz_jacobian, euler_xyz_to_matrix, quaternion_to_matrix
@@ -26,8 +27,14 @@ def test_frames_are_an_euler_chain(env: OpenArticulatedEnv) -> None:
     rotation = euler_xyz_to_matrix(qpos[:, 3:6])
     tool = env.agent.tool_pose()
     torch.testing.assert_close(quaternion_to_matrix(tool[:, 3:]), rotation, atol=1e-5, rtol=0)
-    torch.testing.assert_close(tool[:, :3], qpos[:, :3] + 0.12 * rotation[..., 0], atol=1e-5, rtol=0)
+    torch.testing.assert_close(tool[:, :3], qpos[:, :3] + TIP * rotation[..., 0], atol=1e-5, rtol=0)
     assert (tool[:, 3] >= 0).all()
+
+
+def test_the_hand_reaches_as_far_behind_its_tip_as_policies_think(env: OpenArticulatedEnv) -> None:
+    hand = env.agent.robot.links_map[BODIES[0]]._objs[0]
+    behind = [shape.local_pose.p[0] - shape.half_size[0] for shape in hand.collision_shapes]
+    assert pytest.approx(TIP - min(behind), abs=1e-6) == HAND_LENGTH
 
 
 @pytest.mark.parametrize("axis", range(6))

@@ -23,16 +23,15 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.env.workers import CollectorOptions
-from fb3d_rl.evaluation.rollout import _outcome, run_trials
+from fb3d_rl.evaluation.rollout import _outcome, limits_of, run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.flow.opening import openable_links
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import expert_policy
-from fb3d_rl.policies.hand import VelocityLimits
 
 CAMERA = CameraOptions(resolution=48)
 OPTIONS = EnvOptions(points=300, camera=CAMERA, horizon=150)
-LIMITS = VelocityLimits(OPTIONS.gripper.v_max, OPTIONS.gripper.w_max)
+LIMITS = limits_of(OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +75,16 @@ def test_the_expert_opens_and_repeats_bit_for_bit(objects: list[ArticulatedObjec
     assert [(r.object, r.link, r.steps, r.normalized_distance, r.attach_step) for r in again[::-1]] == outcome, (
         "a trial depends on neither its neighbours nor its place"
     )
+
+
+@pytest.mark.parametrize("frequency", [10, 40])
+def test_the_expert_opens_at_other_control_frequencies(
+    frequency: int, objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    options = replace(OPTIONS, sim_freq=120, control_freq=frequency, horizon=15 * frequency // 2)
+    rows = run_trials("expert", expert_policy(limits_of(options)), objects, trials[::2], options)
+    assert all(row.success for row in rows)
+    assert all(row.seconds < 7.0 for row in rows)
 
 
 def test_a_policy_that_stands_still_opens_nothing(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:

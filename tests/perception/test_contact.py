@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.perception.contact import CANDIDATES, ContactOptions, best_candidate, choose_contact
 
 TOWARDS = torch.tensor([[-1.0, 0.0, 0.0]])
@@ -194,3 +195,15 @@ def test_the_hand_turns_no_further_than_it_has_to() -> None:
     candidates[0, 0, 0] = 0.02
     best = best_candidate(candidates, torch.tensor([[-0.3, 0.0, 0.0]]), TOWARDS, ContactOptions())
     assert torch.equal(best, candidates[:, 0]), "the farther one, and none of the empty rows"
+
+
+def test_a_hand_that_would_come_from_below_the_ground_takes_another_way() -> None:
+    """The gripper's own hand, and the run-up that it needs, have to fit between the ground and the point."""
+    points = plate()
+    points[..., 2] -= 0.5
+    flow = torch.tensor([-0.6, 0.0, -0.8]).expand_as(points).clone()  # the hand would come from below
+    lowest = 0.8 * (ContactOptions().run_up + HAND_LENGTH)
+    for height, fits in ((lowest - 0.01, False), (lowest + 0.01, True)):
+        lift = torch.tensor([0.0, 0.0, height])
+        _, direction, standoff = choose(points * torch.tensor([1.0, 1.0, 0.0]) + lift, flow)
+        assert torch.allclose(direction, standoff, atol=1e-5) == fits

@@ -180,6 +180,7 @@ def looking_on(phases: list[int], sideways: float) -> TensorDict:
 def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(sideways: float, after: list[int]) -> None:
     phases = [SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE]
     td = looking_on(phases, sideways)
+    td["policy", "chosen"] = torch.full((12, 1), 2)
     before = td["policy"].clone()
     InteractivePolicy(expert_policy(LIMITS), None, BetaGate()).look_on(td)
     assert td["policy", "phase"].flatten().tolist() == phases + after
@@ -187,7 +188,9 @@ def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(sid
     chosen = [phase == TRAVEL for phase in after]
     goal = torch.where(torch.tensor(chosen), 1.0 if sideways > 0 else -1.0, 0.0)
     assert torch.equal(td["policy", "contact_point"][6:, 1], goal), "the candidate on the side where the hand is"
-    rest = [key for key in before.keys() if key not in ("phase", "idle", "contact_point")]
+    tries = [1 if phase == SELECT else 2 for phase in after]
+    assert td["policy", "chosen"].flatten().tolist() == [2] * 6 + tries, "what the learner missed was none of its tries"
+    rest = [key for key in before.keys() if key not in ("phase", "idle", "contact_point", "chosen")]
     assert (td["policy"].select(*rest) == before.select(*rest)).all()
 
 

@@ -19,20 +19,21 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.assets.gripper import TIP
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
-from fb3d_rl.env.options import TIP, EnvOptions, default_trial
+from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
 from fb3d_rl.evaluation.flow import predict
-from fb3d_rl.evaluation.rollout import policy_env
+from fb3d_rl.evaluation.rollout import limits_of, policy_env
 from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.flow.opening import box_bounds, box_corners
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.perception.contact import choose_contact
 from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
-from fb3d_rl.policies.hand import VelocityLimits, hand_axis
+from fb3d_rl.policies.hand import hand_axis
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
@@ -158,11 +159,8 @@ class Session:
         if name not in self.flows:
             raise UserError(f"there is no {name} flow without a network; give its weights: checkpoint=PATH")
         self.flow = name
-        self._policy = FlowPolicy(FLOWS[name], VelocityLimits(*self._speeds()), self._policy_options)
+        self._policy = FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options)
         self._picked: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
-
-    def _speeds(self) -> tuple[float, float]:
-        return self._env_options.gripper.v_max, self._env_options.gripper.w_max
 
     def set_part(self, link: int) -> None:
         """Choose the part to open, with the joint state and the view that an evaluation would start from."""
