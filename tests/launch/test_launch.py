@@ -23,7 +23,7 @@ def start(script: str, *arguments: str, cwd: Path, python: tuple[str, ...] = ())
     """In a Python of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *python, str(ROOT / "launch" / script), *arguments]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=250, check=False)
 
 
 def sentence_of(result: subprocess.CompletedProcess[str]) -> str:

@@ -273,6 +273,7 @@ def test_jitter_moves_points_alone_and_dropout_takes_them_out() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)  # the compiler takes its time, beside another test all the more
 @pytest.mark.parametrize("backbone", ["pointnet2", "delayed"])
 def test_a_compiled_network_learns_what_the_other_learns(backbone: str) -> None:
     """Adam's first steps amplify what rounding changes, so that losses agree to a percent only."""
