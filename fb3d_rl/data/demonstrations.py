@@ -27,6 +27,7 @@ from torchrl.data import LazyMemmapStorage, RoundRobinWriter, TensorDictReplayBu
 from fb3d_rl import contract
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import Key, UserError
+from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl demonstrations 1"
 TABLE = "storage_metadata.json"
@@ -191,7 +192,7 @@ class DemonstrationBuffer:
         """Make what was added outlast this process, and a failure of the machine's power."""
         # Without rows there may be files of rows that are no more.
         below = self.path.rglob("*") if len(self) else ()
-        files = [file for file in below if file.is_file() and not file.name.startswith(TABLE)]
+        files = [file for file in below if file.is_file() and not file.name.startswith((TABLE, "."))]
         for file in files:
             _sync(file)
         content = {
@@ -204,10 +205,9 @@ class DemonstrationBuffer:
             "about": self.about,
             "episodes": [asdict(info) for info in self._episodes],
         }
-        beside = self.path / f"{TABLE}.part"
-        beside.write_text(json.dumps(content) + "\n")
-        _sync(beside)
-        os.replace(beside, self.path / TABLE)
+        with replacing(self.path / TABLE) as beside:
+            beside.write_text(json.dumps(content) + "\n")
+            _sync(beside)
         _sync(self.path)
 
     def truncate(self, rows: int) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import pickle
 import subprocess
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl checkpoint 1"
 
@@ -62,15 +62,10 @@ def save_checkpoint(
         "seed": seed,
         "git_revision": git_revision(),
     }
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with replacing(path) as beside, beside.open("wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load_checkpoint(path: Path | str, algo: str | None = None, device: str = "cpu") -> dict[str, Any]:
