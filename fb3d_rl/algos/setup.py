@@ -155,8 +155,9 @@ def protocol(cfg: CommandConfig) -> Protocol:
     """What is evaluated.
 
     Raises:
-        UserError: there are trials to run, but no simulator, or videos to make, but no ffmpeg.
+        UserError: there is no such device; there are trials to run, but no simulator, or videos to make, but no ffmpeg.
     """
+    device = choose_device(cfg.device)
     if cfg.evaluation.trials != 0:
         require_simulator()
         if cfg.evaluation.videos:
@@ -176,6 +177,7 @@ def protocol(cfg: CommandConfig) -> Protocol:
             cfg.evaluation.repeats,
         ),
         decision_seconds=cfg.evaluation.decision_seconds,
+        device=device,
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import shutil
 import signal
@@ -18,8 +19,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.contract import UserError
+from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.files import write_text
 
@@ -27,6 +30,9 @@ if TYPE_CHECKING:  # takes seconds, which every worker process would wait
     from torchrl.data import ReplayBuffer
 
 DONE = "samples.json"
+
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
+"""What reading a data set of which a file is missing or cut raises."""
 
 
 def generate_samples(
@@ -101,9 +107,11 @@ def generate_samples(
 
 def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:
     """The rows of the finished data set in a folder, if they were made by this recipe."""
-    done = out / DONE
-    if done.is_file() and json.loads(done.read_text())["recipe"] == json.loads(json.dumps(recipe)):
-        return TensorDict.load_memmap(out / "rows")
+    try:
+        if json.loads((out / DONE).read_text())["recipe"] == json.loads(json.dumps(recipe)):
+            return _rows(out)
+    except DAMAGED:
+        pass  # not there, or not whole: it is drawn anew
     return None
 
 
@@ -122,8 +130,11 @@ class Joined:
     def __len__(self) -> int:
         return int(self.starts[-1])
 
-    def __getitem__(self, index: torch.Tensor) -> TensorDictBase:
-        """Rows [B] by their numbers [B], in that order."""
+    def __getitem__(self, index: Index) -> TensorDictBase:
+        """The rows that ``index`` picks (:func:`fb3d_rl.data.picking.pick`), in that order."""
+        return pick(index, len(self), self._take)
+
+    def _take(self, index: torch.Tensor) -> TensorDictBase:
         owner = torch.searchsorted(self.starts, index, right=True) - 1
         order = owner.argsort(stable=True)
         taken = [part[index[owner == k] - self.starts[k]] for k, part in enumerate(self.parts)]
@@ -135,10 +146,32 @@ def load_samples(folder: Path) -> TensorDictBase:
     """The finished data set that :func:`generate_samples` left in a folder, as rows [S] on disk.
 
     Raises:
-        UserError: there is none.
+        UserError: there is none, or it is damaged.
     """
     if not (folder / DONE).is_file():
         raise UserError(f"{folder} holds no finished flow samples; give the samples/ of a run of algo=artflownet")
+    try:
+        rows = _rows(folder)
+        contract.check(rows, "sample")
+    except DAMAGED as error:
+        raise UserError(f"the flow samples at {folder} are damaged ({error}); copy or draw them anew") from error
+    return rows
+
+
+def _rows(folder: Path) -> TensorDictBase:
+    """The rows of a data set, once all of its files are seen to be whole.
+
+    Raises:
+        ValueError, and what else is in DAMAGED: they are not.
+    """
+    for about in (folder / "rows").rglob("meta.json"):
+        for name, entry in json.loads(about.read_text()).items():
+            if isinstance(entry, dict) and "dtype" in entry:
+                size = math.prod(entry["shape"]) * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+                file = about.parent / f"{name}.memmap"
+                # Torch would make a file that is missing, and lengthen one that is too short.
+                if file.stat().st_size != size:
+                    raise ValueError(f"{file.name} has another size")
     return TensorDict.load_memmap(folder / "rows")
 
 
