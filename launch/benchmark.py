@@ -40,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> None:
     """Measure, print and write."""
+    import torch
     from rich.console import Console
     from rich.table import Table
 
@@ -61,6 +62,8 @@ def run(options: argparse.Namespace) -> None:
     for key in ("rounds", "steps"):
         if getattr(options, key) < 1:
             raise UserError(f"--{key} {getattr(options, key)} is too small; give 1 or more")
+    if options.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("--device cuda, but torch finds no CUDA device; leave --device cpu")
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())

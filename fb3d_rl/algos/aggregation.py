@@ -25,7 +25,7 @@ from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.workers import Workers
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.rollout import create_env, state_of
-from fb3d_rl.evaluation.trials import draw_trials
+from fb3d_rl.evaluation.trials import BARREN, draw_trials
 
 EVERY = 0.2
 """Time (s) from one frame that is kept to the next: sooner they are nearly alike."""
@@ -60,7 +60,7 @@ def meet_samples(
         TensorDict [S] as :func:`fb3d_rl.data.generate.generate_samples` gives it.
 
     Raises:
-        UserError: all trials of a batch crashed, or showed nothing that moves.
+        UserError: many trials in succession crashed or showed nothing that moves.
     """
     recipe = {"objects": [[obj.id, content_digest(obj)] for obj in objects], "count": count, "seed": protocol.seed,
               "made_by": made_by, "samples": asdict(protocol.samples), "env": asdict(protocol.env)}  # fmt: skip
@@ -74,26 +74,30 @@ def meet_samples(
     rng = np.random.default_rng([protocol.seed, 6])
     create = partial(create_env, tuple(objects), protocol.env, state_of(policy))
     every = max(1, round(EVERY * protocol.env.control_freq))
-    filled = 0
+    filled, barren = 0, 0
     with Workers(create, policy, protocol.collector, protocol.env.horizon) as workers:
         while filled < count:
             trials = draw_trials(views, protocol.samples, rng, min(24, 1 + (count - filled) // 10))
             frames = {episode.index: episode.frames for episode in workers.run(trials, KEYS)}
-            before = filled
             for index, trial in enumerate(trials):  # in this order, whichever ended first
                 episode = frames[index]
+                barren += 1  # until it shows something
                 if episode is None:
                     continue
                 seen = episode[::every]
                 seen = seen[seen["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5][: count - filled]
+                barren = barren if len(seen) else 0
                 part = slice(filled, filled + len(seen))
                 owner, size = number[trial.object], [len(seen)]
                 rows[part] = seen.select(*KEYS).update(
                     {"target": torch.full(size, trial.link), "object": torch.full(size, owner)}
                 )
                 filled = part.stop
-            if filled == before:
-                raise UserError("none of the trials in which clouds were to be met showed a part that moves")
+            if barren >= BARREN and filled < count:
+                raise UserError(
+                    f"none of the last {barren} trials in which clouds were to be met showed a part that moves; choose "
+                    "other objects, or leave data.met_by=null"
+                )
             progress(filled)
     finish(out, recipe)
     return rows

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
-from safetensors import safe_open
+from safetensors import SafetensorError, safe_open
 from tensordict import TensorDictBase
 from torch import nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
@@ -20,7 +20,7 @@ from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import meet_samples
 from fb3d_rl.algos.kinds import KINDS
 from fb3d_rl.assets.catalog import Entry
-from fb3d_rl.contract import UserError, check
+from fb3d_rl.contract import UserError
 from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
@@ -33,8 +33,8 @@ from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.seeds import derived
-from fb3d_rl.training.checkpoint import git_revision, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, emulates_bf16, fit, require_compiler
+from fb3d_rl.training.checkpoint import fitting, git_revision, load_checkpoint, save_checkpoint
+from fb3d_rl.training.fit import FitOptions, check_state, emulates_bf16, fit, require_compiler
 from fb3d_rl.training.processes import rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
 
@@ -65,13 +65,17 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         assist(cfg, out)
         return []
     # Whatever the configuration can get wrong shows here, before any work.
-    device = setup.choose_device(cfg.device)
     protocol = setup.protocol(cfg)
+    device = protocol.device
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     name, kind = cfg.algo.name, KINDS[cfg.algo.name]
     resume = load_checkpoint(out / CHECKPOINT, algo=name) if cfg.resume else None
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
     options, net = fit_options(cfg), new_network(cfg)
+    if resume is not None:
+        with fitting(out / CHECKPOINT):
+            check_state(net, options, resume["state"])
+        best_cosine(out / BEST)
     met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
     if met_by is not None:
         setup.require_simulator()
@@ -175,17 +179,22 @@ def training_rows(cfg: TrainConfig, out: Path) -> Joined:
     """What is trained on: flow samples, and behind them what a policy met."""
     folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
     parts = [load_samples(folder) for folder in folders]
-    for part in parts:
-        check(part, "sample")
     return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(part)) for part in parts))
 
 
 def best_cosine(path: Path) -> float:
-    """Validation cosine of the weights in the file; -inf if there is none."""
+    """Validation cosine of the weights in the file; -inf if there is none.
+
+    Raises:
+        UserError: the file is damaged.
+    """
     if not path.is_file():
         return -math.inf
-    with safe_open(path, framework="pt") as content:
-        return float(content.metadata()["val/cosine"])
+    try:
+        with safe_open(path, framework="pt") as content:
+            return float(content.metadata()["val/cosine"])
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged ({type(error).__name__}): copy it anew, or delete it") from error
 
 
 def fit_options(cfg: TrainConfig) -> FitOptions:
@@ -253,8 +262,9 @@ def load_trained(path: str | Path, name: str) -> CloudNetwork:
     if Path(path).suffix == ".safetensors" or (str(path) == "pretrained" and network is ArtFlowNet):
         return network.from_pretrained(path)
     content = load_checkpoint(path, algo=name)
-    net = network(**content["model_kwargs"])
-    net.load_state_dict(content["state"].get("average") or content["state"]["model"])
+    with fitting(path):
+        net = network(**content["model_kwargs"])
+        net.load_state_dict(content["state"].get("average") or content["state"]["model"])
     return net.eval()
 
 

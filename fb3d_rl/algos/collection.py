@@ -17,7 +17,7 @@ from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.workers import Workers
 from fb3d_rl.evaluation import demonstrations
 from fb3d_rl.evaluation.demonstrations import episode_info
-from fb3d_rl.evaluation.trials import draw_trials
+from fb3d_rl.evaluation.trials import BARREN, draw_trials
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
 
@@ -69,12 +69,12 @@ def collect(
         progress: called with the labels so far.
 
     Raises:
-        UserError: every trial of a batch crashed.
+        UserError: many trials in succession crashed or brought no label.
     """
     categories = {view.obj.id: view.obj.category for view in views}
     episodes: list[tuple[TensorDictBase, EpisodeInfo]] = []
     outcomes: list[tuple[bool, bool, float]] = []
-    count, steps, crashed, started = 0, 0, 0, time.perf_counter()
+    count, steps, crashed, barren, error, started = 0, 0, 0, 0, "", time.perf_counter()
     while count < labels:
         # A number that depends on the labels alone, so that the workers' number decides nothing.
         trials = draw_trials(views, samples, rng, min(48, math.ceil((labels - count) / STEPS_OF_TRIAL)))
@@ -86,19 +86,22 @@ def collect(
             ended[episode.index] = episode.frames
             steps += len(episode.frames)
             progress(min(labels, count + sum(map(len, ended.values()))))
-        if not ended:
-            raise UserError(f"all of {len(trials)} trials crashed, the last one with: {error}")
         for index, trial in enumerate(trials):
+            barren += 1  # until it brings a label
             if index not in ended:
                 continue
             frames = rows.of(ended[index])
             info = episode_info(trial, categories[trial.object], ended[index], number)
             outcomes.append((info.success, bool(ended[index]["next", "contact"].any()),
                              float(ended[index]["expert", "acts"].float().mean())))  # fmt: skip
+            if len(frames):
+                barren = 0
             if count < labels and len(frames):
                 kept = frames[: labels - count]
                 episodes.append((kept, info))
                 count += len(kept)
+        if barren >= BARREN:
+            raise UserError(f"the last {barren} trials brought no label: {rows.why_none(len(outcomes), error)}")
     success, contact, share = np.mean(outcomes, axis=0).tolist()
     ended_at = time.perf_counter()
     seconds = ended_at - started
@@ -135,6 +138,15 @@ class RowsOptions:
     def keys(self) -> list[Key]:
         """What the workers have to send."""
         return [*SEEN, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
+
+    def why_none(self, ended: int, error: str) -> str:
+        """Why trials brought no rows, and what to change, if ``ended`` of a round did not crash with ``error``."""
+        if not (ended and self.attached_only):
+            return f"they crashed, the last one with: {error}"
+        return (
+            "with algo.oracle=true a step counts only while the hand holds a part, and it never did; give env.horizon "
+            "more steps, choose other objects, or algo.oracle=false"
+        )
 
     def of(self, frames: TensorDictBase) -> TensorDictBase:
         """The rows of an episode's frames [T]: with the label as a twist, and what the learner remembers."""

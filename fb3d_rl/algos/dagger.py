@@ -28,6 +28,7 @@ from fb3d_rl.algos.artflownet import load_network
 from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, relabelled
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.workers import Workers, steady_floats
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
@@ -42,8 +43,8 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
 from fb3d_rl.seeds import derived
-from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, Objective, fit, generator
+from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
+from fb3d_rl.training.fit import FitOptions, Objective, check_state, fit, generator
 from fb3d_rl.training.run_log import RunLog, open_logger
 from fb3d_rl.training.schedules import beta
 
@@ -71,7 +72,10 @@ class Labels:
     def __len__(self) -> int:
         return len(self._buffer)
 
-    def __getitem__(self, index: Tensor) -> TensorDictBase:
+    def __getitem__(self, index: Index) -> TensorDictBase:
+        return pick(index, len(self), self._take)
+
+    def _take(self, index: Tensor) -> TensorDictBase:
         rows = self._buffer[index]
         steps = torch.arange(self._chunk)
         ahead = (index[:, None] + steps).clamp(max=len(self) - 1)
@@ -121,7 +125,7 @@ class Run:
     def __init__(self, cfg: TrainConfig, out: Path) -> None:
         self.cfg, self.out, self.algo = cfg, out, cast("ImitationConfig", cfg.algo)
         algo = self.algo
-        self.device, self.protocol = setup.choose_device(cfg.device), setup.protocol(cfg)
+        self.protocol = setup.protocol(cfg)
         setup.require_simulator()
         self.limits = setup.velocity_limits(cfg)
         # A run that was killed before its first checkpoint has lost nothing: it starts anew.
@@ -156,11 +160,20 @@ class Run:
             self.done.rows = len(self.buffer)
             self.save()
         else:
-            self.done = Progression(**saved["state"]["run"])
+            with fitting(out / CHECKPOINT):
+                self.done = Progression(**saved["state"]["run"])
+                networks(self.learner).load_state_dict(self.done.learner)
+                self.policy.gate.load_state_dict(self.done.gate)
+                if self.done.fit is not None:
+                    options = fit_options(algo, cfg.data.labels, cfg.seed, self.done.round)
+                    check_state(networks(self.learner), options, self.done.fit)
             self.buffer = DemonstrationBuffer.open(out / BUFFER)
+            if len(self.buffer) < self.done.rows:
+                raise UserError(
+                    f"{out / BUFFER} holds {len(self.buffer)} of the {self.done.rows} rows that {CHECKPOINT} knows of; "
+                    "copy the run folder anew, or start a new run"
+                )
             self.buffer.truncate(self.done.rows)
-            networks(self.learner).load_state_dict(self.done.learner)
-            self.policy.gate.load_state_dict(self.done.gate)
 
     def save(self) -> None:
         """Write the checkpoint."""
@@ -254,12 +267,12 @@ class Run:
             done.fit, done.log_rows = state, log.rows
             self.save()
 
-        nets = networks(self.learner).to(self.device)
+        nets = networks(self.learner).to(self.protocol.device)
         objective = imitation_objective(self.learner, self.algo, options.seed)
         labels = Labels(self.buffer, self.algo.learner.chunk)
         # Threads that wait for each other on cores that collect would slow both down many times.
         with steady_floats() if self.algo.overlap else nullcontext():
-            fit(nets, labels, options, objective=objective, device=self.device, on_checkpoint=checkpoint,
+            fit(nets, labels, options, objective=objective, device=self.protocol.device, on_checkpoint=checkpoint,
                 resume=done.fit, log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
                 title=f"round {number + 1} of {self.algo.rounds}: fit")  # fmt: skip
         nets.to("cpu")
@@ -332,20 +345,22 @@ def load_policy(path: str | Path, expert: FlowPolicy) -> tuple[str, TensorDictMo
     content = load_checkpoint(path)
     if content["algo"] not in ALGOS:
         raise UserError(f"{path} is a checkpoint of {content['algo']}, not of bc or dagger: choose another file.")
-    kwargs, state = content["model_kwargs"], content["state"]
-    flow_net = None
-    if kwargs["flow_net"] is not None:
-        flow_net = ArtFlowNet(**kwargs["flow_net"])
-        flow_net.load_state_dict(state["flow_model"])
-    limits = VelocityLimits(**kwargs["limits"])
+    with fitting(path):
+        kwargs, state = content["model_kwargs"], content["state"]
+        flow_net = None
+        if kwargs["flow_net"] is not None:
+            flow_net = ArtFlowNet(**kwargs["flow_net"])
+            flow_net.load_state_dict(state["flow_model"])
+        limits = VelocityLimits(**kwargs["limits"])
+        learner = new_learner(LearnerOptions(**kwargs["options"]), limits, kwargs["members"], 0, flow_net)
+        networks(learner).load_state_dict(state["model"])
+        name, oracle = kwargs["name"], kwargs["oracle"]
     if limits != expert.limits:
         raise UserError(
             f"{path} was trained with env.gripper.v_max={limits.linear:g} env.gripper.w_max={limits.angular:g} "
             f"env.control_freq={1 / limits.period:g}; give the same"
         )
-    learner = new_learner(LearnerOptions(**kwargs["options"]), limits, kwargs["members"], 0, flow_net)
-    networks(learner).load_state_dict(state["model"])
-    return kwargs["name"], acting_policy(expert, learner, kwargs["oracle"])
+    return name, acting_policy(expert, learner, oracle)
 
 
 def new_learner(

@@ -169,8 +169,9 @@ def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
     """What is evaluated.
 
     Raises:
-        UserError: there are trials to run, but no simulator, or videos to make, but no ffmpeg.
+        UserError: there is no such device; there are trials to run, but no simulator, or videos to make, but no ffmpeg.
     """
+    device = choose_device(cfg.device)
     if cfg.evaluation.trials != 0:
         require_simulator()
         if cfg.evaluation.videos:
@@ -191,6 +192,7 @@ def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
         ),
         decision_seconds=cfg.evaluation.decision_seconds,
         resume=cfg.resume,
+        device=device,
     )
 
 

@@ -10,7 +10,9 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import multiprocessing
 import os
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import asdict
@@ -26,6 +28,9 @@ from fb3d_rl.files import write_bytes
 
 VERSION = 2
 """Of what is kept and of the reader that makes it; raise it with either."""
+
+SAID = "FB3D_CACHE_SAID"
+"""Environment variable of a command that has said that nothing can be kept."""
 
 DIGEST = hashlib.sha256().digest_size
 
@@ -57,7 +62,7 @@ def content_digest(obj: ArticulatedObject) -> str:
 def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
     """What ``read`` returned for files of this content (:func:`digest_of`); it is called if need be.
 
-    Where entries cannot be written, objects are read anew each time.
+    Where entries cannot be written, objects are read anew each time; that is said once.
     """
     key = hashlib.sha256(f"{VERSION} {trimesh.__version__} {digest}".encode())
     entry = cache_folder() / f"objects/{key.hexdigest()}"
@@ -66,11 +71,27 @@ def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
         if hashlib.sha256(stored[DIGEST:]).digest() == stored[:DIGEST]:
             return _unpack(stored[DIGEST:])
     parsed = read()
-    with suppress(OSError):
+    try:
         entry.parent.mkdir(parents=True, exist_ok=True)
         payload = _pack(parsed)
         write_bytes(entry, hashlib.sha256(payload).digest(), payload)
+    except OSError as error:
+        _tell(error)
     return parsed
+
+
+def _tell(error: OSError) -> None:
+    """Say once for all processes of a command that there is no cache."""
+    process = multiprocessing.current_process()
+    # Workers that start later inherit that it was said; of those that start together one speaks.
+    if SAID in os.environ or not (multiprocessing.parent_process() is None or process.name.endswith("-1")):
+        return
+    os.environ[SAID] = "1"
+    print(
+        f"note: nothing can be kept in the cache {cache_folder()} ({error.strerror}), so objects are read more slowly; "
+        "FB3D_CACHE=DIR chooses another folder",
+        file=sys.stderr,
+    )
 
 
 def _pack(parsed: Parsed) -> memoryview:

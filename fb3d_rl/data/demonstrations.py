@@ -27,6 +27,8 @@ from torchrl.data import LazyMemmapStorage, RoundRobinWriter, TensorDictReplayBu
 from fb3d_rl import contract
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import Key, UserError
+from fb3d_rl.data.picking import Index, pick
+from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl demonstrations 1"
 TABLE = "storage_metadata.json"
@@ -129,17 +131,13 @@ class DemonstrationBuffer:
     def __len__(self) -> int:
         return self._ends[-1]
 
-    def __getitem__(self, index: Tensor | Sequence[int]) -> TensorDictBase:
-        """Copies of the rows ``index`` [K], TensorDict [K].
+    def __getitem__(self, index: Index) -> TensorDictBase:
+        """Copies of the rows that ``index`` picks (:func:`fb3d_rl.data.picking.pick`).
 
         Raises:
             IndexError: there is no such row.
         """
-        index = torch.as_tensor(index, dtype=torch.int64)
-        if len(index) and not 0 <= int(index.min()) <= int(index.max()) < len(self):
-            raise IndexError(f"rows {int(index.min())} to {int(index.max())} of {len(self)}")
-        rows: TensorDictBase = self.replay[index]
-        return rows
+        return pick(index, len(self), self.replay.__getitem__)
 
     @property
     def episodes(self) -> list[EpisodeInfo]:
@@ -191,7 +189,7 @@ class DemonstrationBuffer:
         """Make what was added outlast this process, and a failure of the machine's power."""
         # Without rows there may be files of rows that are no more.
         below = self.path.rglob("*") if len(self) else ()
-        files = [file for file in below if file.is_file() and not file.name.startswith(TABLE)]
+        files = [file for file in below if file.is_file() and not file.name.startswith((TABLE, "."))]
         for file in files:
             _sync(file)
         content = {
@@ -204,10 +202,9 @@ class DemonstrationBuffer:
             "about": self.about,
             "episodes": [asdict(info) for info in self._episodes],
         }
-        beside = self.path / f"{TABLE}.part"
-        beside.write_text(json.dumps(content) + "\n")
-        _sync(beside)
-        os.replace(beside, self.path / TABLE)
+        with replacing(self.path / TABLE) as beside:
+            beside.write_text(json.dumps(content) + "\n")
+            _sync(beside)
         _sync(self.path)
 
     def truncate(self, rows: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import shutil
 import signal
@@ -18,8 +19,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
+from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import content_of, load_object
 from fb3d_rl.contract import UserError
+from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.files import write_text
 
@@ -27,6 +30,9 @@ if TYPE_CHECKING:  # takes seconds, which every worker process would wait
     from torchrl.data import ReplayBuffer
 
 DONE = "samples.json"
+
+DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
+"""What reading a data set of which a file is missing or cut raises."""
 
 
 def generate_samples(
@@ -100,21 +106,25 @@ def generate_samples(
 
 
 def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:
-    """The rows of the finished data set in a folder; None if there is none.
+    """The rows of the finished data set in a folder; None if there is none, or one that is damaged.
 
     Raises:
         UserError: they were made by another recipe, so that they are not this caller's to replace.
     """
-    if not (out / DONE).is_file():
-        return None
-    kept, wanted = recipe_of(out), json.loads(json.dumps(recipe))
+    try:
+        kept, wanted = recipe_of(out), json.loads(json.dumps(recipe))
+    except DAMAGED:
+        return None  # not there, or not whole: it is drawn anew
     if kept != wanted:
         differing = sorted(key for key in {*kept, *wanted} if kept.get(key) != wanted.get(key))
         raise UserError(
             f"{out} holds a finished data set that was made with other {', '.join(differing)}; choose another folder, "
             "or remove it yourself"
         )
-    return TensorDict.load_memmap(out / "rows")
+    try:
+        return _rows(out)
+    except DAMAGED:
+        return None
 
 
 def recipe_of(out: Path) -> dict[str, Any]:
@@ -138,8 +148,11 @@ class Joined:
     def __len__(self) -> int:
         return int(self.starts[-1])
 
-    def __getitem__(self, index: torch.Tensor) -> TensorDictBase:
-        """Rows [B] by their numbers [B], in that order."""
+    def __getitem__(self, index: Index) -> TensorDictBase:
+        """The rows that ``index`` picks (:func:`fb3d_rl.data.picking.pick`), in that order."""
+        return pick(index, len(self), self._take)
+
+    def _take(self, index: torch.Tensor) -> TensorDictBase:
         owner = torch.searchsorted(self.starts, index, right=True) - 1
         order = owner.argsort(stable=True)
         taken = [part[index[owner == k] - self.starts[k]] for k, part in enumerate(self.parts)]
@@ -151,10 +164,32 @@ def load_samples(folder: Path) -> TensorDictBase:
     """The finished data set that :func:`generate_samples` left in a folder, as rows [S] on disk.
 
     Raises:
-        UserError: there is none.
+        UserError: there is none, or it is damaged.
     """
     if not (folder / DONE).is_file():
         raise UserError(f"{folder} holds no finished flow samples; give the samples/ of a run of algo=artflownet")
+    try:
+        rows = _rows(folder)
+        contract.check(rows, "sample")
+    except DAMAGED as error:
+        raise UserError(f"the flow samples at {folder} are damaged ({error}); copy or draw them anew") from error
+    return rows
+
+
+def _rows(folder: Path) -> TensorDictBase:
+    """The rows of a data set, once all of its files are seen to be whole.
+
+    Raises:
+        ValueError, and what else is in DAMAGED: they are not.
+    """
+    for about in (folder / "rows").rglob("meta.json"):
+        for name, entry in json.loads(about.read_text()).items():
+            if isinstance(entry, dict) and "dtype" in entry:
+                size = math.prod(entry["shape"]) * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+                file = about.parent / f"{name}.memmap"
+                # Torch would make a file that is missing, and lengthen one that is too short.
+                if file.stat().st_size != size:
+                    raise ValueError(f"{file.name} has another size")
     return TensorDict.load_memmap(folder / "rows")
 
 

@@ -13,7 +13,6 @@ the expert's labels; which object and trial an episode was is not in them, so it
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +25,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, new_buffer, stranger
+from fb3d_rl.files import replacing, write_text
 
 OWN = "fb3d_rl"
 """Group of a trajectory, and key in the JSON file, for what ManiSkill has no place for."""
@@ -52,17 +52,11 @@ def write(buffer: DemonstrationBuffer, path: Path) -> None:
         "episodes": [_json_entry(k, info, buffer.about) for k, info in enumerate(buffer.episodes)],
         OWN: buffer.about,
     }
-    beside = path.with_name(f".{path.name}.part")
-    try:
+    with replacing(path) as beside:
         with h5py.File(beside, "w") as file:
             for k, info in enumerate(buffer.episodes):
                 _write_episode(file.create_group(f"traj_{k}"), buffer.frames(k).exclude("episode"), info)
-        texts = beside.with_suffix(".json")
-        texts.write_text(json.dumps(about, indent=2) + "\n")
-        os.replace(texts, path.with_suffix(".json"))
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+        write_text(path.with_suffix(".json"), json.dumps(about, indent=2) + "\n")
 
 
 def read(path: Path, out: Path | str) -> DemonstrationBuffer:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,6 +52,8 @@ class Protocol:
         schedule: starts, goals and repetitions of the trials.
         decision_seconds: time limit of a decision, s; None for none.
         resume: go on from the rows that the run folder holds, those of the same trials and policies.
+        device: where the flow network is measured. Policies decide on the CPU, in the workers, so that trials do not
+            depend on it.
     """
 
     samples: SampleOptions
@@ -64,6 +67,7 @@ class Protocol:
     schedule: ScheduleOptions = ScheduleOptions()
     decision_seconds: float | None = None
     resume: bool = False
+    device: torch.device = torch.device("cpu")
 
 
 def evaluate(
@@ -85,7 +89,7 @@ def evaluate(
         policies: name -> policy.
         protocol: what is evaluated.
         facts: entries for summary.json (seed, command, git revision ...).
-        net: the flow network to measure, on the CPU.
+        net: the flow network to measure, on ``protocol.device``; itself it stays where it is.
 
     Returns:
         One row for each scheduled trial and policy.
@@ -240,9 +244,10 @@ def _measure_flow(
     """Rows of the target "part"; the numbers of the target "all" for summary.json; clouds for the report."""
     measured: list[FlowRow] = []
     extra: dict[str, Any] = {}
+    net = copy.deepcopy(net).to(protocol.device)  # the policies' own stays on the CPU
     sets = held_out_samples(objects, protocol.samples, protocol.samples_per_object, protocol.seed)
     for target, (samples, about) in sets.items():
-        predicted = predict(net, samples, torch.device("cpu"))
+        predicted = predict(net, samples, protocol.device)
         rows = flow_rows(predicted, samples, about)
         if target == "part":
             measured = rows

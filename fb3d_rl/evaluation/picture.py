@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
+from fb3d_rl.files import replacing
 
 ARROWS = 60
 """Flow arrows drawn on a cloud: enough to read the motion, few enough to see the cloud."""
@@ -41,9 +42,9 @@ def write_picture(run_dir: Path, columns: int = 4) -> Path:
                 label = "true flow" if row == 0 else "predicted flow"
                 axes.text2D(-0.02, 0.5, label, transform=axes.transAxes, rotation=90, va="center", fontsize=11)
     figure.subplots_adjust(left=0.03, right=0.99, top=0.92, bottom=0.01, wspace=0.02, hspace=0.02)
-    path, part = run_dir / "flow.png", run_dir / "flow.png.part"
-    figure.savefig(part, format="png")
-    os.replace(part, path)
+    path = run_dir / "flow.png"
+    with replacing(path) as part:
+        figure.savefig(part, format="png")
     return path
 
 

@@ -136,6 +136,10 @@ def _visible_trial(
     return None
 
 
+BARREN = 100
+"""Drawn trials in succession that bring nothing at which collecting them ends: fewer may just be bad luck."""
+
+
 def draw_trials(
     views: Sequence[ObjectView], options: SampleOptions, rng: np.random.Generator, count: int
 ) -> list[Trial]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import zip_longest
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from fb3d_rl.evaluation.film import Film, record
 from fb3d_rl.evaluation.rows import TrialRow, film_name
 from fb3d_rl.evaluation.tables import own_policy
 from fb3d_rl.evaluation.trials import Scheduled
+from fb3d_rl.files import replacing
 from fb3d_rl.flow.opening import standing_bounds
 from fb3d_rl.geometry.points import farthest_point_sample
 
@@ -303,17 +303,6 @@ def require_encoder() -> None:
         raise UserError("videos need ffmpeg; install it, or leave videos out: evaluation.videos=0") from error
 
 
-@contextmanager
-def _replacing(path: Path) -> Iterator[Path]:
-    """A file beside ``path`` that takes its place in the end: readers see the whole file or none."""
-    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield part
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 _ENCODERS: dict[str, tuple[str, str, list[str]]] = {
     # The colour matrix is named in the file: players guess differently.
     ".mp4": ("libx264", "yuv420p", ["-preset", "medium", "-crf", "20", "-movflags", "+faststart",
@@ -347,7 +336,7 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View
         "-flags",
         "+bitexact",
     ]
-    with _replacing(path) as part:
+    with replacing(path) as part:
         writer = imageio_ffmpeg.write_frames(
             part,
             (size[0], size[1] + CAPTION),
@@ -385,7 +374,7 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
         image.paste(picture, (left, top))
         draw.text((left, below), name, INK, bold)
         draw.text((left, below + round(1.1 * line)), _state(film, t), FAINT, usual)
-    with _replacing(path) as part:
+    with replacing(path) as part:
         image.save(part)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.files import write_bytes
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.delayed import DelayedPointNet2, PooledAbstraction
 from fb3d_rl.models.dense import DenseLayer, DenseMLP
@@ -58,9 +60,9 @@ def export(net: ArtFlowNet, path: Path, points: int) -> None:
     example = (torch.rand(2, points, 3), torch.zeros(2, points, dtype=torch.bool))
     batch = {0: torch.export.Dim("batch")}
     program = torch.export.export(DenseArtFlowNet(net), example, dynamic_shapes=(batch, batch))
-    beside = path.with_name(f".{path.stem}.part.pt2")
-    torch.export.save(program, beside)
-    beside.replace(path)
+    content = io.BytesIO()  # a full disk ends the whole process where torch writes to it itself
+    torch.export.save(program, content)
+    write_bytes(path, content.getbuffer())
 
 
 def _abstract(layer: SetAbstraction, features: Tensor | None, points: Tensor) -> tuple[Tensor, Tensor]:

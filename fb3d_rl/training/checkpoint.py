@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
-import pickle
 import subprocess
-import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from fb3d_rl.contract import UserError
+from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl checkpoint 1"
+
+CONTENT = {"algo": str, "config": dict, "model_kwargs": dict, "state": dict, "step": int, "seed": int,
+           "git_revision": str}  # fmt: skip
+"""What a checkpoint holds besides its format."""
 
 
 def git_revision() -> str:
@@ -62,15 +67,10 @@ def save_checkpoint(
         "seed": seed,
         "git_revision": git_revision(),
     }
-    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        Path(temporary).unlink(missing_ok=True)
+    with replacing(path) as beside, beside.open("wb") as file:
+        torch.save(content, file)
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def load_checkpoint(path: Path | str, algo: str | None = None, device: str = "cpu") -> dict[str, Any]:
@@ -92,10 +92,33 @@ def load_checkpoint(path: Path | str, algo: str | None = None, device: str = "cp
         raise UserError(f"There is no checkpoint at {path}: check the path or train first.")
     try:
         content = torch.load(path, map_location=device, weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError, ValueError, KeyError) as error:
-        raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): train again.") from error
+    except Exception as error:  # noqa: BLE001, of a file that was cut torch may raise anything
+        if isinstance(error, OSError) and error.filename is not None:  # the file cannot be read at all
+            raise
+        raise UserError(
+            f"{path} is damaged or no checkpoint ({type(error).__name__}): copy it anew or train again."
+        ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UserError(f"{path} is not a checkpoint of this version of fb3d_rl: train again.")
+    for key, kind in CONTENT.items():
+        if not isinstance(content.get(key), kind):
+            raise UserError(f'{path} is damaged (it lacks "{key}"): copy it anew or train again.')
     if algo is not None and content["algo"] != algo:
         raise UserError(f"{path} is a checkpoint of {content['algo']}, not of {algo}: choose another file.")
     return content
+
+
+@contextmanager
+def fitting(path: Path | str) -> Iterator[None]:
+    """Put to use in here what the checkpoint at ``path`` holds: where that fails, the file is named.
+
+    Raises:
+        UserError: it does.
+    """
+    try:
+        yield
+    except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(
+            f"{path} holds other weights or entries than are read here ({type(error).__name__}): "
+            "choose another file, copy it anew or train again."
+        ) from error

@@ -7,6 +7,7 @@ resumed run equals a straight one bit for bit on a CPU.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import math
 import signal
@@ -344,17 +345,8 @@ def fit(
     if options.compile:
         cast(nn.Module, model.network).compile(dynamic=True)
     objective = objective or flow_objective(model if processes == 1 else DistributedDataParallel(model), options, share)
-    optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
-    average = None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)
-    step, loss_sum, loss_count = 0, 0.0, 0
-    if resume is not None:
-        _check_same_run(resume["options"], options)
-        model.load_state_dict(resume["model"])
-        optimizer.load_state_dict(resume["optimizer"])
-        step, loss_sum, loss_count = resume["step"], resume["loss_sum"], resume["loss_count"]
-        if average is not None:
-            average.module.load_state_dict(resume["average"])
-            average.n_averaged.fill_(step)
+    optimizer, average = _companions(model, options)
+    step, loss_sum, loss_count = (0, 0.0, 0) if resume is None else _restore(model, options, optimizer, average, resume)
 
     def state() -> dict[str, Any]:
         return {
@@ -442,6 +434,43 @@ def fit(
         model.load_state_dict(average.module.state_dict())
     model.eval()
     return last
+
+
+def check_state(model: nn.Module, options: FitOptions, state: dict[str, Any]) -> None:
+    """Raise what :func:`fit` would raise of a ``state`` to resume from, before any work; leaves the model as it is.
+
+    Raises:
+        UserError: the state belongs to other options.
+    """
+    tried = copy.deepcopy(model)
+    _restore(tried, options, *_companions(tried, options), state)
+
+
+def _companions(model: nn.Module, options: FitOptions) -> tuple[torch.optim.Adam, AveragedModel | None]:
+    """The optimizer, and the average of the weights if there is to be one."""
+    optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
+    average = None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)
+    return optimizer, average
+
+
+def _restore(
+    model: nn.Module,
+    options: FitOptions,
+    optimizer: torch.optim.Adam,
+    average: AveragedModel | None,
+    state: dict[str, Any],
+) -> tuple[int, float, int]:
+    """Load a state of :func:`fit`; returns the step, and the sum and the number of the losses to log."""
+    _check_same_run(state["options"], options)
+    model.load_state_dict(state["model"])
+    optimizer.load_state_dict(state["optimizer"])
+    for weights, moments in optimizer.state.items():
+        if moments["exp_avg"].shape != weights.shape:  # which Adam would find out in its first step
+            raise ValueError("the optimizer's state is of other weights")
+    if average is not None:
+        average.module.load_state_dict(state["average"])
+        average.n_averaged.fill_(state["step"])
+    return state["step"], state["loss_sum"], state["loss_count"]
 
 
 def _check_same_run(before: dict[str, Any], options: FitOptions) -> None:

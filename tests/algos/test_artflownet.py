@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,23 @@ import pytest
 import torch
 
 from fb3d_rl import contract
-from fb3d_rl.algos.artflownet import MET, SAMPLES, run, training_rows
+from fb3d_rl.algos import dagger, setup
+from fb3d_rl.algos.artflownet import (
+    BEST,
+    CHECKPOINT,
+    MET,
+    SAMPLES,
+    load_network,
+    run,
+    run_evaluation,
+    training_rows,
+)
+from fb3d_rl.config import TRAINED, UNTRAINED
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.generate import load_samples
+from fb3d_rl.evaluation import evaluate
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
 from fb3d_rl.training.run_log import read_rows
 
 Config = Callable[[str, list[str]], Any]
@@ -74,3 +89,104 @@ def test_training_starts_from_given_weights(tmp_path: Path, config: Config, weig
     with pytest.raises(UserError, match="no weights"):
         run(config("train", [*SMALL, "algo.start_from=nowhere.safetensors"]), tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_a_checkpoint_that_does_not_fit_is_named_before_any_work(tmp_path: Path, config: Config, weights: Path) -> None:
+    """Whatever it is taken for: cut anywhere, of another version, or of other shapes."""
+    net = load_network(weights)
+    whole = {"step": 1, "model": net.state_dict(), "average": None}
+    other = {name: value[:1] if value.ndim else value for name, value in whole["model"].items()}
+    states: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+        "shapes": (net.arguments, whole | {"model": other}),
+        "names": (net.arguments, whole | {"model": {"weight": torch.zeros(1)}}),
+        "nothing": (net.arguments, {"step": 1}),
+        "arguments": (net.arguments | {"depth": 3}, whole),
+        "backbone": (net.arguments | {"backbone": "transformer"}, whole),
+    }
+    paths = [tmp_path / f"{name}.pt" for name in states]
+    for path, (arguments, state) in zip(paths, states.values(), strict=True):
+        state.setdefault("model", None)
+        save_checkpoint(path, algo="artflownet", config={}, model_kwargs=arguments, state=state, seed=0)
+    for suffix, content in ((".pt", paths[0].read_bytes()), (".safetensors", weights.read_bytes())):
+        for size in (0, 7, 3000, len(content) // 2, len(content) - 5):
+            paths.append(tmp_path / f"cut{size}{suffix}")
+            paths[-1].write_bytes(content[:size])
+    for path in paths:
+        with pytest.raises(UserError, match=path.name) as raised:
+            load_network(path)
+        assert "\n" not in str(raised.value)
+        for key in ("algo.start_from", "data.met_by"):
+            with pytest.raises(UserError, match=path.name):
+                run(config("train", [*SMALL, f"{key}={path}"]), tmp_path / "out")
+        with pytest.raises(UserError, match=path.name):
+            run_evaluation(
+                config("evaluate", ["experiment=smoke", "policy=artflownet", f"checkpoint={path}"]), tmp_path / "out"
+            )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_does_not_go_on_from_a_state_that_does_not_fit(tmp_path: Path, config: Config) -> None:
+    out, settings = tmp_path / "run", [*SMALL, "data.train_samples=4", "algo.ema=0.9"]
+    run(config("train", settings), out)
+    content = load_checkpoint(out / CHECKPOINT)
+    shutil.rmtree(out / SAMPLES)  # nothing is drawn before the mistake is found
+
+    def other(key: str, change: Any) -> dict[str, Any]:
+        return content | {"state": {**content["state"], key: change}}
+
+    moments = copy.deepcopy(content["state"]["optimizer"])
+    moments["state"][0]["exp_avg"] = torch.zeros(3)
+    bad = [
+        other(key, value) for key, value in (("model", {}), ("average", {}), ("optimizer", {}), ("optimizer", moments))
+    ]
+    bad += [content | {"state": {k: v for k, v in content["state"].items() if k != key}}
+            for key in ("model", "optimizer", "options", "loss_sum")]  # fmt: skip
+    for changed in bad:
+        torch.save(changed, out / CHECKPOINT)
+        with pytest.raises(UserError, match=r"checkpoint\.pt"):
+            run(config("train", [*settings, "resume=true"]), out)
+    torch.save(content, out / CHECKPOINT)
+    (out / BEST).write_bytes(b"cut")
+    with pytest.raises(UserError, match=r"best\.safetensors is damaged"):
+        run(config("train", [*settings, "resume=true"]), out)
+    assert not (out / SAMPLES).exists()
+
+
+def test_a_device_that_is_not_there_is_refused_by_every_command(
+    tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    commands = [(dagger.run if name in dagger.ALGOS else run, "train", f"algo={name}") for name in TRAINED]
+    commands += [(run_evaluation, "evaluate", f"policy={name}") for name in (*UNTRAINED, "artflownet")]
+    commands += [(dagger.run_evaluation, "evaluate", f"policy={name}") for name in dagger.ALGOS]
+    for command, name, choice in commands:
+        given = ["checkpoint=nowhere.pt"] if name == "evaluate" else []
+        with pytest.raises(UserError, match="device=cuda, but torch finds no CUDA device"):
+            command(config(name, ["experiment=smoke", "device=cuda", choice, *given]), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_flow_is_measured_on_the_device(
+    tmp_path: Path, config: Config, weights: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Torch's device without memory stands for a GPU; what runs there gives no numbers."""
+    seen = []
+
+    def predicts(net: torch.nn.Module, samples: Any, device: torch.device) -> torch.Tensor:
+        seen.append((device, {value.device for value in net.parameters()}))
+        return samples["privileged", "flow"]
+
+    monkeypatch.setattr(evaluate, "predict", predicts)
+    monkeypatch.setattr(setup, "choose_device", lambda name: torch.device("meta" if name == "cuda" else "cpu"))
+    given = [
+        "policy=artflownet",
+        f"checkpoint={weights}",
+        "device=cuda",
+        "evaluation.trials=1",
+        "env.horizon=2",
+        "evaluation.clouds=0",
+    ]
+    rows = run_evaluation(config("evaluate", ["experiment=smoke", "assets.categories=[Box]", *given]), tmp_path / "out")
+    meta = torch.device("meta")
+    assert seen == [(meta, {meta})] * 2
+    assert [row.status for row in rows] == ["ok"] * len(rows), "policies decide on the CPU all the same"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -121,6 +122,39 @@ def test_behaviour_cloning_is_one_round_of_the_expert(first: Path, tmp_path: Pat
             for out in (tmp_path, first)]  # fmt: skip
     assert fits[0] == fits[1] and len(fits[0]) == 2, "four steps, of which every second one is logged"
     assert [row.policy for row in read_trials(tmp_path / "rows.csv")] == ["bc"]
+
+
+def test_a_checkpoint_that_does_not_fit_is_named_before_any_work(first: Path, tmp_path: Path, config: Config) -> None:
+    whole = load_checkpoint(first / CHECKPOINT)
+    kwargs, state = whole["model_kwargs"], whole["state"]
+
+    def without(entries: dict[str, Any], key: str) -> dict[str, Any]:
+        return {name: value for name, value in entries.items() if name != key}
+
+    for k, change in enumerate((
+        {"model_kwargs": without(kwargs, "options")},
+        {"model_kwargs": kwargs | {"limits": {"speed": 1.0}}},
+        {"model_kwargs": kwargs | {"options": kwargs["options"] | {"width": 16}}},
+        {"state": without(state, "model")},
+        {"state": state | {"model": {name: value[..., :1] for name, value in state["model"].items()}}},
+    )):  # fmt: skip
+        path = tmp_path / f"{k}.pt"
+        torch.save(whole | change, path)
+        with pytest.raises(UserError, match=f"{k}.pt holds other"):
+            run_evaluation(config("evaluate", ["experiment=smoke", "policy=dagger", f"checkpoint={path}"]), tmp_path)
+    shutil.copytree(first, tmp_path / "run")
+    done = state["run"]
+    for change in (
+        {"run": without(done, "round") | {"level": 1}},
+        {"run": done | {"learner": {}}},
+        {"run": done | {"gate": {"other": torch.zeros(1)}}},
+        {"run": done | {"round": 1, "fit": {"step": 1}}},
+        {"run": done | {"rows": 10**6}},
+    ):
+        torch.save(whole | {"state": state | change}, tmp_path / "run" / CHECKPOINT)
+        with pytest.raises(UserError, match=r"checkpoint\.pt"):
+            run(config("train", [*SMALL, "resume=true"]), tmp_path / "run")
+    assert len(DemonstrationBuffer.open(tmp_path / "run" / BUFFER)) == 90, "nothing is lost"
 
 
 def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:

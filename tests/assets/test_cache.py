@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +113,24 @@ def test_without_a_cache_objects_are_read_all_the_same(
     monkeypatch.setenv("FB3D_CACHE", str(tmp_path / "file"))
     assert_same(load_object(folder), load_object(folder))
     assert len(parses) == 2
+
+
+def test_a_full_disk_costs_the_cache_alone(
+    own: Path,
+    folder: Path,
+    parses: list[Path],
+    full_disk: Callable[[int], AbstractContextManager[None]],
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("FB3D_CACHE_SAID", "")  # so that it is as before in the end
+    monkeypatch.delenv("FB3D_CACHE_SAID")
+    with full_disk(1000):
+        assert_same(load_object(folder), load_object(folder))
+    assert len(parses) == 2
+    assert not [path for path in own.rglob("*") if path.is_file()]
+    said = capfd.readouterr().err.splitlines()
+    assert len(said) == 1 and str(own) in said[0] and "FB3D_CACHE" in said[0], said
 
 
 @pytest.mark.slow

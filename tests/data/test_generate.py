@@ -143,3 +143,27 @@ def test_nothing_to_open_is_refused_and_leaves_no_finished_set(tmp_path: Path, b
     with pytest.raises(UserError, match="can be opened"):
         draw(tmp_path / "s", [block])
     assert not (tmp_path / "s" / DONE).exists()
+
+
+def cut(file: Path, share: float) -> None:
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_set_that_was_cut_is_refused_and_drawn_anew(tmp_path: Path, folders: list[Path], share: float) -> None:
+    whole = draw(tmp_path / "whole", folders).clone()
+    names = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file())
+    assert len(names) > 6
+    for k, name in enumerate(names):
+        out = tmp_path / str(k)
+        shutil.copytree(tmp_path / "whole", out)
+        cut(out / name, share)
+        if name.name != DONE:  # of which only that it is there is asked
+            with pytest.raises(UserError, match=f"{out} are damaged"):
+                load_samples(out)
+            (out / name).unlink()
+            with pytest.raises(UserError, match=f"{out} are damaged"):
+                load_samples(out)
+        assert same(draw(out, folders), whole)
+        assert same(load_samples(out), whole)

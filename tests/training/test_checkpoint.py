@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fb3d_rl.contract import UserError
-from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
+from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
 
 
 def save(path: Path, value: float = 1.0) -> None:
@@ -56,3 +56,35 @@ def test_every_bad_file_is_named(tmp_path: Path) -> None:
     save(path)
     with pytest.raises(UserError, match="of artflownet, not of bc"):
         load_checkpoint(path, algo="bc")
+
+
+def test_a_file_that_was_cut_anywhere_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.pt"
+    state = {"step": 3, "model": {"weight": torch.zeros(5000)}}
+    save_checkpoint(path, algo="artflownet", config={}, model_kwargs={}, state=state, seed=4)
+    whole = path.read_bytes()
+    assert len(whole) > 20000
+    for size in sorted({*range(12), *range(0, len(whole), 199), *range(len(whole) - 60, len(whole))}):
+        path.write_bytes(whole[:size])
+        with pytest.raises(UserError, match="damaged"):
+            load_checkpoint(path)
+
+
+@pytest.mark.parametrize("key", ["algo", "config", "model_kwargs", "state", "step", "seed", "git_revision"])
+def test_what_a_file_lacks_is_named(tmp_path: Path, key: str) -> None:
+    path = tmp_path / "checkpoint.pt"
+    save(path)
+    content = load_checkpoint(path)
+    for change in ({}, {key: torch.zeros(1)}):
+        torch.save({name: value for name, value in content.items() if name != key} | change, path)
+        with pytest.raises(UserError, match=f'lacks "{key}"'):
+            load_checkpoint(path, algo="artflownet")
+
+
+def test_what_does_not_fit_is_told_without_torchs_words() -> None:
+    with (
+        pytest.raises(UserError, match="run/checkpoint.pt holds other weights") as raised,
+        fitting("run/checkpoint.pt"),
+    ):
+        torch.nn.Linear(2, 3).load_state_dict({"weight": torch.zeros(3, 4)})
+    assert "\n" not in str(raised.value) and "state_dict" not in str(raised.value)
