@@ -135,8 +135,8 @@ class Run:
         self.learner = new_learner(learner_options(algo), self.limits, algo.members, cfg.seed, flow_net)
         self.policy = InteractivePolicy(self.expert, self.learner, new_gate(algo))
         self.rows = rows_options(algo, self.limits, self.policy.gate)
-        train, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
-        self.objects, self.tested = [entry.load() for entry in train], setup.load(held_out)
+        self.entries, held_out = setup.train_entries(cfg.assets, out, cfg.seed)
+        self.objects, self.tested = [entry.load() for entry in self.entries], setup.load(held_out)
         self.views = [ObjectView(obj, self.protocol.samples.camera) for obj in self.objects]
         limit = algo.validate_trials
         self.validation = schedule(self.tested, self.protocol.samples, cfg.seed, limit)[0] if limit else []
@@ -299,7 +299,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     job.train()
     policies: dict[str, Any] = {"expert": job.expert} if cfg.evaluation.expert else {}
     policies[policy_name(job.algo)] = acting_policy(job.expert, job.learner, job.algo.oracle)
-    facts = setup.facts(cfg) | {"policy": policy_name(job.algo), "labels": job.labels, "expert_share": job.expert_share}
+    facts = setup.facts(cfg, job.entries) | {"policy": policy_name(job.algo), "labels": job.labels}
+    facts["expert_share"] = job.expert_share
     return evaluate(out, job.tested, policies, job.protocol, facts)
 
 

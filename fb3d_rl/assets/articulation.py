@@ -64,7 +64,8 @@ class Link:
 class ArticulatedObject:
     """An object: its id, category, folder's URDF file and links (parents first).
 
-    ``dropped`` names what was left out while reading (degenerate meshes and the like), for reports.
+    ``dropped`` are the remarks of its reader (names that are missing, limits that were swapped, ...), of which ``lost``
+    are those on geometry that the object's files describe and ``links`` do not hold.
     """
 
     id: str
@@ -72,6 +73,7 @@ class ArticulatedObject:
     urdf: Path
     links: tuple[Link, ...]
     dropped: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
 
     @cached_property
     def movable(self) -> tuple[int, ...]:

@@ -24,13 +24,13 @@ import trimesh
 from fb3d_rl.assets.articulation import Joint, Link, Mesh
 from fb3d_rl.files import write_bytes
 
-VERSION = 2
+VERSION = 3
 """Of what is kept and of the reader that makes it; raise it with either."""
 
 DIGEST = hashlib.sha256().digest_size
 
-Parsed = tuple[tuple[Link, ...], tuple[str, ...]]
-"""An object's links and what was left out of it."""
+Parsed = tuple[tuple[Link, ...], tuple[str, ...], tuple[str, ...]]
+"""An object's links, the remarks of its reader, and those of them on lost geometry."""
 
 
 def cache_folder() -> Path:
@@ -64,7 +64,7 @@ def cached(folder: Path, files: Iterable[Path], read: Callable[[], Parsed]) -> P
 
 def _pack(parsed: Parsed) -> memoryview:
     """A table in JSON, then the vertices [V, 3] and faces [F, 3] of all meshes, each mesh once."""
-    links, dropped = parsed
+    links, dropped, lost = parsed
     meshes = {id(mesh): mesh for link in links for mesh in (*link.visuals, *link.collisions)}
     number = {key: k for k, key in enumerate(meshes)}
 
@@ -84,6 +84,7 @@ def _pack(parsed: Parsed) -> memoryview:
             for link in links
         ],
         "dropped": dropped,
+        "lost": lost,
         "meshes": [(len(mesh.vertices), len(mesh.faces)) for mesh in meshes.values()],
     }
     out = io.BytesIO()
@@ -128,4 +129,4 @@ def _unpack(payload: memoryview) -> Parsed:
         )
         for entry in table["links"]
     )
-    return links, tuple(table["dropped"])
+    return links, tuple(table["dropped"]), tuple(table["lost"])
