@@ -128,7 +128,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     policies[name] = kind.policy(net.to("cpu"), limits, speeds)
-    return evaluate(out, objects, policies, protocol, setup.facts(cfg), net if kind.flow else None)
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg, train), net if kind.flow else None)
 
 
 def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:

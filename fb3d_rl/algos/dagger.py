@@ -141,6 +141,7 @@ class Run:
         self.policy = InteractivePolicy(self.expert, self.learner, new_gate(algo))
         self.rows = rows_options(algo, self.limits, self.policy.gate)
         entries = setup.train_entries(cfg.assets, out, cfg.seed)
+        self.entries = entries.train
         self.objects, self.tested = [entry.load() for entry in entries.train], setup.load(entries.held_out)
         self.views = [ObjectView(obj, self.protocol.samples.camera) for obj in self.objects]
         limit = algo.validate_trials
@@ -316,7 +317,8 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     job.train()
     policies: dict[str, Any] = {"expert": job.expert} if cfg.evaluation.expert else {}
     policies[policy_name(job.algo)] = acting_policy(job.expert, job.learner, job.algo.oracle)
-    facts = setup.facts(cfg) | {"policy": policy_name(job.algo), "labels": job.labels, "expert_share": job.expert_share}
+    facts = setup.facts(cfg, job.entries) | {"policy": policy_name(job.algo), "labels": job.labels}
+    facts["expert_share"] = job.expert_share
     return evaluate(out, job.tested, policies, job.protocol, facts)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -13,7 +14,14 @@ import torch
 
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.catalog import Entry, entry_of, folder_entries, partnet_catalog, procedural_catalog
+from fb3d_rl.assets.catalog import (
+    Entry,
+    entry_of,
+    folder_entries,
+    lost_geometry,
+    partnet_catalog,
+    procedural_catalog,
+)
 from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
@@ -23,6 +31,7 @@ from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOption
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.evaluation.report import LOST_GEOMETRY
 from fb3d_rl.evaluation.rollout import limits_of
 from fb3d_rl.evaluation.trials import ScheduleOptions
 from fb3d_rl.evaluation.video import require_encoder
@@ -219,9 +228,11 @@ def workers(count: int | None) -> int:
     return (os.cpu_count() or 1) if count is None else count
 
 
-def facts(cfg: CommandConfig) -> dict[str, Any]:
+def facts(cfg: CommandConfig, trained_on: Sequence[Entry] = ()) -> dict[str, Any]:
     """What summary.json says about a run besides its numbers."""
+    lost = lost_geometry(entry.known for entry in trained_on if entry.known is not None)
     return {
+        **({LOST_GEOMETRY: lost} if lost else {}),
         "command": " ".join(["python", *sys.argv]),
         "seed": cfg.seed,
         "git_revision": git_revision(),

@@ -64,8 +64,9 @@ class Link:
 class ArticulatedObject:
     """An object: its id, category, folder's URDF file and links (parents first).
 
-    ``dropped`` names what was left out while reading (degenerate meshes and the like), for reports; ``content`` is a
-    digest of the files that it was read from, "" for an object that was made in memory.
+    ``dropped`` are the remarks of its reader (names that are missing, limits that were swapped, ...), of which ``lost``
+    are those on geometry that the object's files describe and ``links`` do not hold; ``content`` is a digest of the
+    files that it was read from, "" for an object that was made in memory.
     """
 
     id: str
@@ -73,6 +74,7 @@ class ArticulatedObject:
     urdf: Path
     links: tuple[Link, ...]
     dropped: tuple[str, ...] = ()
+    lost: tuple[str, ...] = ()
     content: str = ""
 
     @cached_property

@@ -26,7 +26,7 @@ import trimesh
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.files import write_bytes
 
-VERSION = 2
+VERSION = 3
 """Of what is kept and of the reader that makes it; raise it with either."""
 
 SAID = "FB3D_CACHE_SAID"
@@ -34,8 +34,8 @@ SAID = "FB3D_CACHE_SAID"
 
 DIGEST = hashlib.sha256().digest_size
 
-Parsed = tuple[tuple[Link, ...], tuple[str, ...]]
-"""An object's links and what was left out of it."""
+Parsed = tuple[tuple[Link, ...], tuple[str, ...], tuple[str, ...]]
+"""An object's links, the remarks of its reader, and those of them on lost geometry."""
 
 
 def cache_folder() -> Path:
@@ -56,7 +56,7 @@ def digest_of(folder: Path, files: Iterable[Path]) -> str:
 
 def content_digest(obj: ArticulatedObject) -> str:
     """What an object is made of, as a digest: of its files, or of its links where it was made in memory."""
-    return obj.content or hashlib.sha256(_pack((obj.links, ()))).hexdigest()
+    return obj.content or hashlib.sha256(_pack((obj.links, (), ()))).hexdigest()
 
 
 def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
@@ -96,7 +96,7 @@ def _tell(error: OSError) -> None:
 
 def _pack(parsed: Parsed) -> memoryview:
     """A table in JSON, then the vertices [V, 3] and faces [F, 3] of all meshes, each mesh once."""
-    links, dropped = parsed
+    links, dropped, lost = parsed
     meshes = {id(mesh): mesh for link in links for mesh in (*link.visuals, *link.collisions)}
     number = {key: k for k, key in enumerate(meshes)}
 
@@ -116,6 +116,7 @@ def _pack(parsed: Parsed) -> memoryview:
             for link in links
         ],
         "dropped": dropped,
+        "lost": lost,
         "meshes": [(len(mesh.vertices), len(mesh.faces)) for mesh in meshes.values()],
     }
     out = io.BytesIO()
@@ -160,4 +161,4 @@ def _unpack(payload: memoryview) -> Parsed:
         )
         for entry in table["links"]
     )
-    return links, tuple(table["dropped"])
+    return links, tuple(table["dropped"]), tuple(table["lost"])

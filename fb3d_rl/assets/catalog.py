@@ -13,11 +13,14 @@ from rich.progress import Progress
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders, find_split_file
-from fb3d_rl.assets.partnet_mobility import load_object, load_objects, read_category
+from fb3d_rl.assets.partnet_mobility import listed, load_object, load_objects, load_usable, read_category
 from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.contract import UserError
 
 log = logging.getLogger(__name__)
+
+MOST_TOLD = 5
+"""Of so many objects at once it is told what they lost, of the others how many they are."""
 
 
 @dataclass(frozen=True)
@@ -34,8 +37,32 @@ class Entry:
         return self.folder.name
 
     def load(self) -> ArticulatedObject:
-        """The object, read now unless it is known."""
-        return self.known or load_object(self.folder)
+        """The object, read now unless it is known.
+
+        Raises:
+            UserError: it cannot be used.
+        """
+        if self.known is not None:
+            return self.known
+        obj = load_usable(self.folder)
+        tell_lost([obj])
+        return obj
+
+
+def lost_geometry(objects: Iterable[ArticulatedObject]) -> dict[str, list[str]]:
+    """What of the objects' files is no part of them, by the ids of those that lost some of their geometry."""
+    return {obj.id: list(obj.lost) for obj in objects if obj.lost}
+
+
+def tell_lost(objects: Iterable[ArticulatedObject]) -> None:
+    """Log which of some objects lost geometry in reading: without it they are not what their files say."""
+    lost = lost_geometry(objects)
+    for name, remarks in list(lost.items())[:MOST_TOLD]:
+        log.warning("object %s: geometry left out while reading: %s", name, listed(remarks))
+    if len(lost) > MOST_TOLD:
+        log.warning(
+            "geometry was left out of %d more objects; launch/objects.py validate DIR names it", len(lost) - MOST_TOLD
+        )
 
 
 def procedural_catalog(
@@ -89,6 +116,8 @@ def partnet_catalog(
 ) -> list[Entry]:
     """The objects below a PartNet-Mobility root that ``split`` selects; broken ones are left out and named.
 
+    Objects that lost geometry in reading are named too.
+
     Args:
         root: see :mod:`fb3d_rl.assets.folders`.
         split: see :func:`fb3d_rl.assets.splits.select_ids`.
@@ -106,6 +135,7 @@ def partnet_catalog(
     objects, skipped = load_objects([folders[name] for name in chosen])
     for item in skipped:
         log.warning("skipped: %s", item.reason)
+    tell_lost(objects)
     return [Entry(obj.urdf.parent, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
 
 

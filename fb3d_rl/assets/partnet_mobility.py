@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import math
 import struct
-from collections.abc import Collection, Iterable
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -51,12 +52,18 @@ BROKEN = (ValueError, LookupError, AttributeError, TypeError, ArithmeticError, M
 FARTHEST = 1e4
 """Largest coordinate, m, and largest joint limit, m or rad, that is believed."""
 
+REMARKS = 3
+"""So many remarks on an object are told in one line."""
+
+CORNERS = 4
+"""A solid has so many corners at least; a collision mesh with fewer collides as a thin plate where it moves."""
+
 
 def load_object(folder: str | Path) -> ArticulatedObject:
     """Read one object's folder.
 
-    Meshes are given in their link's frame (the URDF's visual and collision origins applied). Meshes without area
-    are left out and named in ``dropped``.
+    Meshes are given in their link's frame (the URDF's visual and collision origins applied), their faces turned where
+    the scale mirrors. Meshes without area and shapes that are no meshes are left out and named in ``lost``.
 
     Raises:
         UserError: the folder, the URDF or a mesh is missing or broken; the message names it.
@@ -66,8 +73,8 @@ def load_object(folder: str | Path) -> ArticulatedObject:
     try:
         category = read_category(folder)
         content = digest_of(folder, _sources(folder, urdf))
-        links, dropped = cached(content, _Reader(folder, urdf).read)
-        return ArticulatedObject(folder.name, category, urdf, links, dropped, content)
+        links, dropped, lost = cached(content, _Reader(folder, urdf).read)
+        return ArticulatedObject(folder.name, category, urdf, links, dropped, lost, content)
     except (ParseError, DefusedXmlException) as error:
         raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
     except OSError as error:
@@ -90,6 +97,28 @@ def _urdf_of(folder: Path) -> Path:
             f"object {folder.name}: {folder / URDFS[-1]} does not exist, so the folder is no PartNet-Mobility object"
         )
     return urdf
+
+
+def load_usable(folder: str | Path) -> ArticulatedObject:
+    """As :func:`load_object`, for whoever looks at the object or touches it.
+
+    Raises:
+        UserError: as there, or no link has a mesh.
+    """
+    obj = load_object(folder)
+    if not any(link.visuals for link in obj.links):
+        why = f": {listed(obj.lost)}" if obj.lost else ""
+        raise UserError(
+            f"object {obj.id}: no link has a visual mesh, so there is nothing to see{why}; give its links meshes "
+            f"({', '.join(MESHES)})"
+        )
+    return obj
+
+
+def listed(remarks: Sequence[str]) -> str:
+    """Some remarks in one line: the first ones, and how many more there are."""
+    shown = "; ".join(remarks[:REMARKS])
+    return shown + (f"; and {len(remarks) - REMARKS} more" if len(remarks) > REMARKS else "")
 
 
 def read_category(folder: Path) -> str:
@@ -162,6 +191,7 @@ class _Reader:
         self.files: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
         self.placed: dict[tuple[str, bytes, bytes, bool], Mesh] = {}
         self.dropped: list[str] = []
+        self.lost: list[str] = []
 
     def parse(self) -> Element:
         try:
@@ -170,7 +200,7 @@ class _Reader:
             raise ParseError(str(error)) from error
 
     def read(self) -> Parsed:
-        """The links, parents first, and what was left out.
+        """The links, parents first, and the remarks on what was read.
 
         Raises:
             UserError: something is missing or broken.
@@ -207,7 +237,8 @@ class _Reader:
                     collisions=self.shapes(elements[name], "collision"),
                 )
             )
-        return tuple(links), tuple(dict.fromkeys(self.dropped))
+        lost = tuple(dict.fromkeys(self.lost))
+        return tuple(links), (*lost, *dict.fromkeys(self.dropped)), lost
 
     def fail(self, what: str) -> NoReturn:
         raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.urdf}")
@@ -299,44 +330,69 @@ class _Reader:
         return order
 
     def shapes(self, link: Element, tag: str) -> tuple[Mesh, ...]:
-        meshes = []
+        """The meshes of a link's ``<visual>`` or ``<collision>`` elements; all other shapes are lost."""
+        meshes: list[Mesh] = []
+        others: Counter[str] = Counter()
         for element in link.findall(tag):
             mesh = element.find("geometry/mesh")
+            shapes = [shape for shape in element.iterfind("geometry/*") if shape is not mesh]
+            others.update(f"<{shape.tag}>" for shape in shapes)
             if mesh is None:
-                self.dropped.append(f"a {tag} of {link.get('name')}: no mesh")
+                others["no shape"] += not shapes
                 continue
             filename = self.attribute(mesh, "filename")
             placed = self.place(
                 filename, self.numbers(mesh.get("scale"), 3, 1.0), self.origin(element), tag == "visual"
             )
             if tag == "collision" and self.urdf.name == DECOMPOSED:
-                meshes += self.pieces(placed)
+                meshes += self.pieces(placed, filename)
             elif len(placed.faces):
                 meshes.append(placed)
+                if tag == "collision":
+                    self.remark_corners(placed, filename)
+        self.lost += [
+            f"{count} {tag}{'s' * (count > 1)} of {link.get('name')}: {shape} in place of a mesh"
+            for shape, count in (+others).items()
+        ]
         return tuple(meshes)
 
     def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool) -> Mesh:
         """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.
 
         ``seen``: it is only looked at, so that each point and triangle is enough once. What collides stays as it is:
-        for PhysX a triangle has one side.
+        the simulator makes hulls and surfaces of it.
         """
         key = (filename, scale.tobytes(), transform.tobytes(), seen)
         if key not in self.placed:
             vertices, faces = self.mesh(filename)
-            if seen and len(faces):
-                vertices, faces = _each_once(vertices, faces)
             with np.errstate(over="ignore", invalid="ignore"):
+                corners = (vertices * scale)[faces]
+                sides = corners[:, 1:] - corners[:, :1]
+                if not np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1).sum() > 0:
+                    self.lost.append(f"{filename}: no surface")
+                    faces = faces[:0]
+                if seen and len(faces):
+                    vertices, faces = _each_once(vertices, faces)
                 moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
             if len(faces) and not abs(moved).max() <= FARTHEST:
                 self.fail(f"the mesh {filename} reaches {abs(moved).max():.3g} m from its link")
-            self.placed[key] = Mesh(moved, faces)
+            # A mirror image turns inside out what is seen from outside.
+            self.placed[key] = Mesh(moved, faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else faces)
         return self.placed[key]
 
-    def pieces(self, mesh: Mesh) -> list[Mesh]:
+    def pieces(self, whole: Mesh, filename: str) -> list[Mesh]:
         """The convex pieces of a link that were written as one file."""
-        bodies = trimesh.Trimesh(mesh.vertices, mesh.faces).split(only_watertight=False)
-        return [Mesh(np.asarray(body.vertices), np.asarray(body.faces)) for body in bodies]
+        bodies = trimesh.Trimesh(whole.vertices, whole.faces).split(only_watertight=False)
+        meshes = [Mesh(np.asarray(body.vertices), np.asarray(body.faces)) for body in bodies]
+        for mesh in meshes:
+            self.remark_corners(mesh, filename)
+        return meshes
+
+    def remark_corners(self, mesh: Mesh, filename: str) -> None:
+        if len(np.unique(mesh.vertices[np.unique(mesh.faces)].astype(np.float32), axis=0)) < CORNERS:
+            self.dropped.append(
+                f"{filename}: fewer than {CORNERS} distinct vertices; where it moves, it collides as a thin plate"
+            )
 
     def mesh(self, filename: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         path = (self.folder / filename).resolve()
@@ -356,11 +412,6 @@ class _Reader:
             raise UserError(f"object {self.folder.name}: the mesh {filename} is broken ({error})") from error
         if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all()):
             self.fail(f"the mesh {filename} has vertices that are missing or no numbers")
-        corners = vertices[faces]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=-1).sum()
-        if not area > 0:
-            self.dropped.append(f"{filename}: no surface")
-            faces = faces[:0]
         self.files[path] = (vertices, faces)
         return self.files[path]
 
@@ -392,7 +443,7 @@ def load_objects(folders: Collection[Path]) -> tuple[list[ArticulatedObject], li
     skipped: list[Skipped] = []
     for folder in track(folders, "objects", transient=True):
         try:
-            objects.append(load_object(folder))
+            objects.append(load_usable(folder))
         except UserError as error:
             skipped.append(Skipped(folder.name, str(error)))
     if not objects:

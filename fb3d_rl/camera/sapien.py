@@ -41,18 +41,27 @@ def _renderer(device: str) -> sapien.render.RenderSystem:
     return sapien.render.RenderSystem(sapien.Device(device))
 
 
-def require_renderer() -> str:
+def require_renderer(
+    need: str = "camera.kind=sapien",
+    otherwise: str = "use camera.kind=raycast",
+    devices: Sequence[tuple[str, str]] = (("gpu", "cuda"), ("cpu", "cpu")),
+) -> str:
     """Start the renderer, so that a machine without one says so before any work, and keep it.
 
+    Args:
+        need: what needs it.
+        otherwise: what can be done without it.
+        devices: ManiSkill's ``render_backend`` and SAPIEN's device of those that will do, the best first.
+
     Returns:
-        ManiSkill's ``render_backend`` for it: "gpu", or "cpu" where no GPU renders.
+        The ``render_backend`` of the first device that renders.
 
     Raises:
         UserError: Vulkan finds nothing to render on.
     """
     reasons = []
     sapien.render.set_log_level("critical")  # the exceptions say it
-    for backend, device in (("gpu", "cuda"), ("cpu", "cpu")):
+    for backend, device in devices:
         try:
             _renderer(device)
         except RuntimeError as error:
@@ -61,9 +70,9 @@ def require_renderer() -> str:
             sapien.render.set_log_level("warn")
             return backend
     raise UserError(
-        f"camera.kind=sapien needs Vulkan, not found ({'; '.join(reasons)}); install the GPU's Vulkan driver or, "
-        "for rendering on the CPU, Mesa's lavapipe 24.3 or later (Debian and Ubuntu: mesa-vulkan-drivers), or use "
-        "camera.kind=raycast"
+        f"{need} needs Vulkan, not found ({'; '.join(reasons)}); install the GPU's Vulkan driver or, "
+        "for rendering on the CPU, Mesa's lavapipe 24.3 or later (Debian and Ubuntu: mesa-vulkan-drivers), or "
+        f"{otherwise}"
     )
 
 

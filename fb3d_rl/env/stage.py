@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +20,7 @@ from sapien.physx import (
     get_default_material,
 )
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Joint
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Mesh
 from fb3d_rl.assets.gripper import gripper_meshes
 from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.contract import UserError
@@ -37,6 +39,10 @@ OBJECT_BIT = 30
 Parts of real objects overlap at rest and hulls overlap even more, so contact among them would jam every joint; and
 an object that stands on the ground would rub on it. The gripper has no such bit: it touches all of them.
 """
+
+
+PLATE = 0.002
+"""Thickness (m) of what PhysX cannot make a body of; it makes flat panes as thick by itself."""
 
 
 class Model:
@@ -71,22 +77,19 @@ class Model:
         """Collision shapes of each link [L], cooked once: making them anew takes longer than the rest of a reset.
 
         What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
-        move as their surface, placed in the world: a hull would close hollow bodies.
+        move as both sides of their surface, placed in the world: a hull would close hollow bodies.
         """
-        material, unscaled = get_default_material(), [1.0, 1.0, 1.0]
         moves = self.tree.descendants.any(0).tolist()
         poses = self.poses(np.zeros(len(self.object.movable)))
         shapes: list[list[Any]] = []
         for link, pose, moving in zip(self.object.links, poses, moves, strict=True):
             shapes.append([])
             for mesh in link.collisions:
-                vertices = mesh.vertices.astype(np.float32)
                 if moving:
-                    # From points (not from the file) PhysX makes a thin plate of a flat mesh, such as a pane of glass.
-                    shape = PhysxCollisionShapeConvexMesh(vertices, unscaled, material)
+                    shape = _hull(mesh)
                     shape.set_density(self._options.density)
                 else:
-                    shape = PhysxCollisionShapeTriangleMesh(vertices, mesh.faces.astype(np.uint32), unscaled, material)
+                    shape = _surface(mesh)
                     shape.local_pose = sapien.Pose(pose)
                 shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
                 shapes[-1].append(shape)
@@ -216,6 +219,65 @@ class Stage:
         """World poses [L + 3, 4, 4] of the object's links, then of the gripper's hand and fingers."""
         bodies = (*self.links, *self.bodies)
         return np.array([body.entity_pose.to_transformation_matrix() for body in bodies], dtype=np.float64)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """PhysX' complaints about meshes that are mended."""
+    sapien.set_log_level("off")
+    try:
+        yield
+    finally:
+        sapien.set_log_level("warn")  # SAPIEN's default; there is no way to ask for the present one
+
+
+def _hull(mesh: Mesh) -> PhysxCollisionShapeConvexMesh:
+    """The mesh's convex hull; a plate where that has no volume, such as that of a triangle."""
+    # From points (not from the file) PhysX makes a thin plate of most flat meshes, such as a pane of glass.
+    try:
+        with _quiet():
+            return PhysxCollisionShapeConvexMesh(mesh.vertices.astype(np.float32), [1.0] * 3, get_default_material())
+    except RuntimeError:
+        return PhysxCollisionShapeConvexMesh(_plate(mesh.vertices), [1.0] * 3, get_default_material())
+
+
+def _surface(mesh: Mesh) -> PhysxCollisionShapeTriangleMesh | PhysxCollisionShapeConvexMesh:
+    """The mesh's surface; a plate where that is too thin for PhysX to have any.
+
+    For PhysX a triangle has one side, while real meshes look either way or are open sheets.
+    """
+    faces = np.concatenate([mesh.faces, _other_sides(mesh)]).astype(np.uint32)
+    try:
+        with _quiet():
+            return PhysxCollisionShapeTriangleMesh(
+                mesh.vertices.astype(np.float32), faces, [1.0] * 3, get_default_material()
+            )
+    except RuntimeError:
+        return _hull(mesh)
+
+
+def _other_sides(mesh: Mesh) -> NDArray[np.int64]:
+    """The faces [F, 3] turned over, without those that the mesh holds already, as many of the dataset's do."""
+    number = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)[1].reshape(-1)
+
+    def keys(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Faces by their corners' places, the lowest first: the same for the same side of the same triangle."""
+        places = number[faces]
+        first = places.argmin(1)[:, None]
+        in_turn: NDArray[np.int64] = np.take_along_axis(places, (first + np.arange(3)) % 3, axis=1)
+        return in_turn @ np.array([len(number) ** 2, len(number), 1])
+
+    turned = mesh.faces[:, ::-1]
+    return turned[~np.isin(keys(turned), keys(mesh.faces))]
+
+
+def _plate(vertices: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points [8 V, 3] whose hull is that of ``vertices`` [V, 3], grown to ``PLATE`` along axes where it is thinner."""
+    spread = vertices - vertices.mean(0)
+    axes = np.linalg.eigh(spread.T @ spread)[1].T
+    lacks = np.maximum(PLATE - np.ptp(spread @ axes.T, axis=0), 0.0)
+    grown = 0.5 * np.array(list(itertools.product((-1, 1), repeat=3))) * lacks @ axes
+    return (vertices[:, None] + grown).reshape(-1, 3).astype(np.float32)
 
 
 def _axis_frame(joint: Joint) -> NDArray[np.float64]:

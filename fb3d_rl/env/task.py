@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import sapien
 import torch
 from mani_skill import logger
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.system.backend import render_backend_name_mapping, sim_backend_name_mapping
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.registration import register
 from mani_skill.utils.structs import Articulation
@@ -34,6 +35,7 @@ from fb3d_rl.env.options import EnvOptions, Trial, default_trial, drawn_fraction
 from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage
 from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
+from fb3d_rl.flow.opening import openable_links
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 logger.addFilter(lambda record: "does not support rendering" not in record.getMessage())  # it draws without
@@ -89,7 +91,8 @@ class OpenArticulatedEnv(BaseEnv):
             ``render_mode="rgb_array"`` with SAPIEN.
 
     Raises:
-        UserError: there is no object, none has something to open, or a renderer is asked for that is not there.
+        UserError: there is no object, none has something to open, or a simulator, a renderer or a mode is asked for
+            that is not there.
     """
 
     SUPPORTED_OBS_MODES = ("pointcloud", "rgbd", "state", "state_dict", "none")
@@ -109,22 +112,81 @@ class OpenArticulatedEnv(BaseEnv):
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:
-        self.objects = {obj.id: obj for obj in find_objects(objects, split)}
-        if not self.objects:
-            raise UserError("the environment has no object; give it at least one")
+        self.use(find_objects(objects, split), link)
         self.options = options or EnvOptions()
-        self.link = link
         self.stages = []
-        self._models: dict[str, Model] = {}
         self._trial_rng = np.random.default_rng(0)
-        if self.options.camera.kind == "sapien" or kwargs.get("obs_mode") == "rgbd":
-            kwargs.setdefault("render_backend", require_renderer())
+        self._require_modes(**kwargs)
+        kwargs["sim_backend"] = _require_simulator(kwargs.get("sim_backend", "auto"), num_envs)
+        kwargs["render_backend"] = self._require_renderer(**kwargs)
         super().__init__(
             num_envs=num_envs,
             robot_uids=FloatingSuctionGripper.uid,
             sim_config=dict(sim_freq=self.options.sim_freq, control_freq=self.options.control_freq),
-            **{"render_backend": "none", **kwargs},
+            **kwargs,
         )
+
+    def _require_modes(self, **modes: Any) -> None:
+        for name, known in (
+            ("obs_mode", self.SUPPORTED_OBS_MODES),
+            ("reward_mode", self.SUPPORTED_REWARD_MODES),
+            ("render_mode", self.SUPPORTED_RENDER_MODES),
+        ):
+            if modes.get(name) not in (None, *known):
+                raise UserError(f"{name}={modes[name]!r} is none of this task's; choose from {', '.join(known)}")
+
+    def _require_renderer(
+        self,
+        render_backend: str | None = None,
+        obs_mode: str | None = None,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> str:
+        """ManiSkill's ``render_backend``: the one that is asked for, or the best there is where one is needed."""
+        needs = {
+            "camera.kind=sapien": self.options.camera.kind == "sapien",
+            "obs_mode=rgbd": obs_mode == "rgbd",
+            f"render_mode={render_mode}": render_mode not in (None, "rgb_array"),
+        }
+        need = next((name for name, needed in needs.items() if needed), None)
+        if render_backend in (None, "none"):
+            if need is None:
+                return "none"
+            if render_backend is not None:
+                raise UserError(f"{need} needs a renderer, but render_backend is 'none'; leave one of them out")
+            return require_renderer(need, f"leave out {need}")
+        name = _device(render_backend_name_mapping, "render_backend", render_backend)
+        return require_renderer(
+            f"render_backend={render_backend}",
+            "leave it out: pictures are then drawn without",
+            [(render_backend, name)],
+        )
+
+    def use(self, objects: Iterable[ArticulatedObject], link: str | None = None) -> None:
+        """Let trials be of these objects from the next reset of all environments on.
+
+        Args:
+            objects: the objects.
+            link: see the class.
+
+        Raises:
+            UserError: there is no object, or none has something to open.
+        """
+        self.objects = {obj.id: obj for obj in objects}
+        self.link = link
+        self._models: dict[str, Model] = {}
+        if not self.objects:
+            raise UserError("the environment has no object; give it at least one")
+        if not any(self._to_open(obj, openable_links(obj)) for obj in self.objects.values()):
+            raise self._nothing_opens()
+
+    def _to_open(self, obj: ArticulatedObject, links: Sequence[int]) -> list[int]:
+        """Those of an object's openable links that the environment opens."""
+        return [i for i in links if self.link in (None, obj.links[i].name)]
+
+    def _nothing_opens(self) -> UserError:
+        what = "no part that opens" if self.link is None else f"no part that opens and is called {self.link!r}"
+        return UserError(f"the objects have {what}; choose other objects: {', '.join([*self.objects][:5])}")
 
     @property
     def _default_sim_config(self) -> SimConfig:
@@ -196,12 +258,11 @@ class OpenArticulatedEnv(BaseEnv):
         rng, names = self._trial_rng, list(self.objects) if stage is None else [stage.object.id]
         for i in rng.permutation(len(names)):
             model = self._model(names[i])
-            links = [j for j in model.links if self.link in (None, model.object.links[j].name)]
+            links = self._to_open(model.object, model.links)
             if links:
                 break
         else:
-            what = "no part that opens" if self.link is None else f"no part that opens and is called {self.link!r}"
-            raise UserError(f"the objects have {what}; choose other objects: {', '.join(names[:5])}")
+            raise self._nothing_opens()
         link, seed = int(rng.choice(links)), int(rng.integers(2**31))
         fraction = drawn_fraction(self.options.start, rng)
         for _ in range(VIEW_TRIES):
@@ -486,6 +547,20 @@ class OpenArticulatedEnv(BaseEnv):
             return pictures
         return torch.from_numpy(np.stack([self._shaded(stage) for stage in self.stages]))
 
+    def render_human(self) -> Any:
+        """SAPIEN's viewer.
+
+        Raises:
+            UserError: there is no screen to open its window on.
+        """
+        try:
+            return super().render_human()
+        except RuntimeError as error:
+            raise UserError(
+                f"render_mode=human: no window can be opened ({error}); run it where there is a screen, or take "
+                "render_mode=rgb_array"
+            ) from error
+
     def _shaded(self, stage: Stage) -> NDArray[np.uint8]:
         meshes = [*(link.visuals for link in stage.object.links), *stage.model.gripper]
         colors = [*link_colors(stage.object, stage.trial.link), *[GRIPPER] * len(stage.bodies)]
@@ -544,6 +619,51 @@ class OpenArticulatedEnv(BaseEnv):
 # ManiSkill's own decorator would wrap the task in a time limit that overrides ``truncated``.
 register(TASK, OpenArticulatedEnv)
 gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True)
+
+
+def _device(known: Mapping[str, str], key: str, word: str) -> str:
+    """SAPIEN's name of the device that a backend's name means, such as "cuda:1" for "gpu:1".
+
+    Raises:
+        UserError: there is no such backend.
+    """
+    name, _, number = word.partition(":")
+    if name == "pci":  # ManiSkill hands it to SAPIEN
+        return word
+    if name not in known or (number and not number.isdigit()):
+        raise UserError(f"{key}={word!r} is none; choose from {', '.join(known)}")
+    kind = "cpu" if known[name].endswith("cpu") else "cuda"
+    return f"{kind}:{number}" if number else kind
+
+
+def _require_simulator(word: str, num_envs: int) -> str:
+    """ManiSkill's ``sim_backend`` for so many environments.
+
+    Raises:
+        UserError: there is no such backend, or it is not here.
+    """
+    if num_envs < 1:
+        raise UserError(f"num_envs={num_envs} is too small; give 1 or more")
+    chosen = ("gpu" if num_envs > 1 else "cpu") if word == "auto" else word
+    device = _device({"auto": "", **sim_backend_name_mapping}, "sim_backend", chosen)
+    if device == "cpu":
+        if num_envs > 1:
+            raise UserError(
+                f"num_envs={num_envs} needs CUDA, and sim_backend={word} runs one environment in a process; give "
+                "num_envs=1, or run several processes (gymnasium.vector.AsyncVectorEnv, collector=process)"
+            )
+        return chosen
+    try:
+        sapien.Device(device)
+        if not torch.cuda.is_available():
+            raise RuntimeError("torch finds no CUDA device")
+    except RuntimeError as error:
+        asks = f"num_envs={num_envs}" if word == "auto" else f"sim_backend={word}"
+        raise UserError(
+            f"{asks} needs a CUDA device, which is not there ({error}); give num_envs=1 and sim_backend=cpu, and for "
+            "more environments run several processes (gymnasium.vector.AsyncVectorEnv, collector=process)"
+        ) from error
+    return chosen
 
 
 def _joint_truth(stage: Stage, poses: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+import trimesh
 from gymnasium.spaces import Box
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -15,7 +17,7 @@ from torchrl.data.tensor_specs import Binary, Bounded, Categorical, Composite, T
 from torchrl.envs import EnvBase
 
 from fb3d_rl import contract
-from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial
 
@@ -192,6 +194,18 @@ def _specs_of(sample: TensorDictBase) -> Composite:
     return Composite(specs, shape=sample.batch_size, device=sample.device)
 
 
+def _stand_in() -> ArticulatedObject:
+    """A block that slides out of another: what an environment shows before its first trial."""
+    block = trimesh.creation.box((0.2, 0.2, 0.2))
+    back, front = (
+        (Mesh(np.asarray(block.vertices) + [x, 0.0, 0.1], np.asarray(block.faces, dtype=np.int64)),)
+        for x in (0.1, -0.1)
+    )
+    slide = Joint("slide", "prismatic", np.eye(4), np.array([-1.0, 0.0, 0.0]), (0.0, 0.2))
+    links = (Link("back", "", -1, None, back, back), Link("front", "", 0, slide, front, front))
+    return ArticulatedObject("stand-in", "", Path(), links)
+
+
 def require_simulator(otherwise: str = "leave out the trials: evaluation.trials=0") -> None:
     """Import the simulator, so that a machine without it says so before any work.
 
@@ -230,7 +244,14 @@ def make_env(
     """
     from fb3d_rl.env.task import OpenArticulatedEnv
 
-    env = TrialEnv(OpenArticulatedEnv(objects, options, **kwargs))
+    if kwargs.get("num_envs", 1) == 1:
+        # The specs are those of any object. One of the given that cannot be built would cost more here than its trial.
+        link = kwargs.pop("link", None)
+        task = OpenArticulatedEnv([_stand_in()], options, **kwargs)
+        env = TrialEnv(task)
+        task.use(objects, link)
+    else:  # several scenes are built together, and seldom
+        env = TrialEnv(OpenArticulatedEnv(objects, options, **kwargs))
     first = env.observation_spec.zero()
     sees = ("observation", "points") in first.keys(include_nested=True)
     for group in ("observation", "privileged", "metrics") if sees else ("metrics",):

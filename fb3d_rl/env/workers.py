@@ -85,7 +85,7 @@ class EpisodeCollector(Collector):
         try:
             with steady_floats():
                 frames = self.rollout()[0].exclude("collector")  # TorchRL's count of trajectories: of this worker alone
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a policy's library may want to end the process
             log.exception("object %s, link %d, seed %d: the trial crashed", trial.object, trial.link, trial.seed)
             return f"{type(error).__name__}: {error}"
         return frames if keys is None else frames.select(*keys)
@@ -123,7 +123,8 @@ class Workers:
 
     Which worker runs a trial does not change its frames: a policy sees one environment at a time, on one thread. A
     trial that raises an exception costs itself only. So does one whose worker dies, of a crash of the simulator's
-    library or of a signal: the worker is started again and goes on with the next trial.
+    library or of a signal: the worker is started again and goes on with the next trial. Trials for which there is no
+    worker, since none can be started, have that as their error.
 
     To be used in a ``with`` statement, since workers stay, for further calls of :meth:`run`, until :meth:`close`. As
     always with processes that Python spawns, a script may use them below ``if __name__ == "__main__":`` only.
@@ -153,6 +154,7 @@ class Workers:
         )  # fmt: skip
         self._workers = [_Worker(self._new_collector) for _ in range(1 if self._direct else options.workers)]
         self._restarts, self._lock, self._stopping = options.restarts, threading.Lock(), False
+        self._not_run = "not run: every worker died, and collector.restarts is used up"
         self._threads, self._others = torch.get_num_threads(), set(multiprocessing.active_children())
         self._owns_ray = options.backend == "ray" and _start_ray()
         self._folder = tempfile.TemporaryDirectory(prefix="fb3d_rl-") if options.backend == "process" else None
@@ -174,9 +176,10 @@ class Workers:
                 memory from another process, so fewer are cheaper.
         """
         if self._direct:
-            self._workers[0].start()
+            started = self._started(self._workers[0])
             for index, trial in enumerate(trials):
-                yield _episode(index, self._workers[0].call("episode", trial, keys))
+                outcome = self._workers[0].call("episode", trial, keys) if started else self._not_run
+                yield _episode(index, outcome)
             return
         jobs: _Jobs = queue.SimpleQueue()
         for index in range(len(trials)):
@@ -201,7 +204,7 @@ class Workers:
                 else:
                     yield result
             while not jobs.empty():
-                yield Episode(jobs.get(), error="not run: every worker died, and collector.restarts is used up")
+                yield Episode(jobs.get(), error=self._not_run)
         finally:
             while working and any(thread.is_alive() for thread in threads):
                 self._stop()  # more than once: a process may just be about to start
@@ -246,14 +249,10 @@ class Workers:
                     again = worker.starts > 0
                     if again and not self._may_restart():
                         return
-                    try:
-                        worker.start()
-                    except Exception:
-                        if not again:
-                            raise
-                        # Not the end of the run: it is logged, and the next attempt counts as a restart too.
-                        log.exception("a worker could not be started again")
-                        continue
+                    if not self._started(worker):
+                        if again:  # the next attempt counts as a restart too
+                            continue
+                        return
                 try:
                     index = jobs.get_nowait()
                 except queue.Empty:
@@ -270,6 +269,23 @@ class Workers:
             results.put(error)
         finally:
             results.put(None)
+
+    def _started(self, worker: _Worker) -> bool:
+        """Start a worker, unless it is; whether that went well. What did not is not the end of the run.
+
+        Raises:
+            UserError: what keeps it from starting for the first time can be mended.
+        """
+        try:
+            worker.start()
+        except Exception as error:
+            if isinstance(error, UserError) and not worker.starts:
+                raise
+            if not self._stopping:  # by which processes end that are just being started
+                log.exception("a worker could not be started")
+            self._not_run = f"not run: a worker could not be started ({type(error).__name__}: {error})"
+            return False
+        return True
 
     def _may_restart(self) -> bool:
         with self._lock:
@@ -306,7 +322,7 @@ class Workers:
         """The one place that makes TorchRL's collectors: an :class:`EpisodeCollector`, here or elsewhere."""
         local = dict(use_buffers=False, auto_register_policy_transforms=False)
         if self._direct:
-            return EpisodeCollector(self._create_env_fn, self._policy, **local, **self._rollout)
+            return EpisodeCollector(partial(_idle_env, self._create_env_fn), self._policy, **local, **self._rollout)
         remote = dict(
             backend=self._options.backend,
             sync=True,
@@ -316,7 +332,7 @@ class Workers:
             weight_sync_schemes={},
             **self._rollout,
         )
-        create = [partial(_unpacked_env, self._packed_env)]
+        create = [partial(_idle_env, partial(_unpacked_env, self._packed_env))]
         if self._options.backend == "ray":
             return Collector(create, collector_kwargs=local, **remote)
         return Collector(create, num_threads=self._threads, **local, **remote)
@@ -328,6 +344,13 @@ def _unpacked(content: Path | bytes) -> Any:
 
 def _unpacked_env(content: Path | bytes) -> EnvBase:
     env: EnvBase = _unpacked(content)()
+    return env
+
+
+def _idle_env(create_env_fn: Callable[[], EnvBase]) -> EnvBase:
+    """The environment, in which no trial starts: TorchRL's collectors reset theirs before they are asked for any."""
+    env = create_env_fn()
+    env.set_trials([])
     return env
 
 

@@ -18,13 +18,14 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.catalog import lost_geometry
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
 from fb3d_rl.evaluation.picture import write_picture
-from fb3d_rl.evaluation.report import write_report
+from fb3d_rl.evaluation.report import LOST_GEOMETRY, write_report
 from fb3d_rl.evaluation.rollout import run_trials
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
 from fb3d_rl.evaluation.tables import DECISION, show, summary
@@ -98,6 +99,9 @@ def evaluate(
         UserError: it is to go on from rows of other trials or policies.
     """
     numbers: dict[str, Any] = dict(facts)
+    lost = facts.get(LOST_GEOMETRY, {}) | lost_geometry(obj for obj, _ in objects)
+    if lost:
+        numbers[LOST_GEOMETRY] = lost
     measured: list[FlowRow] = []
     if net is not None:
         measured, extra = _measure_flow(out, net, objects, protocol)

@@ -17,6 +17,9 @@ from fb3d_rl.evaluation.rows import policies as policies_in
 from fb3d_rl.evaluation.runs import Run, read_run
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, MOTION_ONLY, SUCCESS, Metric
 
+LOST_GEOMETRY = "lost_geometry"
+"""Key of a summary: what the run's objects lost in reading, by their ids."""
+
 
 def write_report(run_dir: Path, out: Path | None = None) -> Path:
     """Write the report of one run as a single HTML file that needs no network.
@@ -39,6 +42,7 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     body = (
         f"<header><h1>{text(name)}</h1>{page.facts(_facts(numbers), COPIED)}</header>"
         + page.section("Results", _headline(numbers))
+        + page.section("Geometry left out while reading", _lost(numbers))
         + page.section("Success by category", _success_bars(numbers))
         + page.section("How trials ended", _ends(run.rows, policies, numbers.get("policy")))
         + page.section("What it took", effort(numbers, colors))
@@ -54,6 +58,17 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
 
 def _facts(numbers: Mapping[str, Any]) -> list[tuple[str, object]]:
     return [(label, numbers[key]) for key, label in FACTS.items() if numbers.get(key) not in (None, "")]
+
+
+def _lost(numbers: Mapping[str, Any]) -> str:
+    lost = numbers.get(LOST_GEOMETRY, {})
+    rows = "".join(
+        f'<tr><td class="text">{text(name)}</td><td class="text">{"<br>".join(map(text, remarks))}</td></tr>'
+        for name, remarks in lost.items()
+    )
+    head = '<tr><th class="text">object</th><th class="text">what it lacks</th></tr>'
+    says = "These objects are used without some of the shapes that their files describe."
+    return f'<p class="soft">{says}</p>{page.table(head, rows, scroll=True)}' if rows else ""
 
 
 def _card(metric: Metric, numbers: Mapping[str, Any], prefix: str = "") -> tuple[str, str, list[str]]:

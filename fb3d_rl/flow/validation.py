@@ -81,7 +81,10 @@ def examine(folder: Path) -> Verdict:
 def findings(obj: ArticulatedObject) -> list[Finding]:
     """The flaws of an object that could be read, the serious ones first."""
     found = [*_joints(obj), *_surfaces(obj), *_blocked(obj)]
-    found += [Finding(f"left out while reading: {what}", serious=False) for what in obj.dropped]
+    found += [
+        Finding(f"{'left out' if what in obj.lost else 'noted'} while reading: {what}", serious=False)
+        for what in obj.dropped
+    ]
     return sorted(found, key=lambda finding: not finding.serious)
 
 

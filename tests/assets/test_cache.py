@@ -51,7 +51,7 @@ def assert_same(a: ArticulatedObject, b: ArticulatedObject) -> None:
             for p, q in ((x.vertices, y.vertices), (x.faces, y.faces)):
                 assert p.dtype == q.dtype and p.shape == q.shape and p.tobytes() == q.tobytes()
 
-    assert (a.id, a.category, a.urdf, a.dropped) == (b.id, b.category, b.urdf, b.dropped)
+    assert (a.id, a.category, a.urdf, a.dropped, a.lost) == (b.id, b.category, b.urdf, b.dropped, b.lost)
     for one, two in zip(a.links, b.links, strict=True):
         assert (one.name, one.semantic, one.parent) == (two.name, two.semantic, two.parent)
         meshes(one.visuals, two.visuals)
@@ -65,9 +65,13 @@ def assert_same(a: ArticulatedObject, b: ArticulatedObject) -> None:
 
 
 def test_an_object_is_parsed_once(own: Path, folder: Path, parses: list[Path]) -> None:
+    urdf = folder / "mobility.urdf"
+    box = "<visual><geometry><box/></geometry></visual>"
+    urdf.write_text(urdf.read_text().replace("<visual", f"{box}<visual", 1))
     first = load_object(folder)
     moved = folder.rename(folder.with_name("elsewhere"))
     second = load_object(moved)
+    assert first.lost
     assert len(parses) == 1 and second.id == "elsewhere" and second.urdf.parent == moved
     moved.rename(folder)
     assert_same(first, load_object(folder))

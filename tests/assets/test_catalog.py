@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.assets.catalog import partnet_catalog, procedural_catalog
+from fb3d_rl.assets.catalog import folder_entries, lost_geometry, partnet_catalog, procedural_catalog
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import FAMILIES
 from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
@@ -30,6 +30,25 @@ def test_procedural_halves_are_disjoint_and_repeatable(tmp_path: Path) -> None:
     for entry in first:
         obj = load_object(entry.folder)
         assert (obj.id, obj.category) == (entry.id, entry.category)
+
+
+def test_objects_that_lost_geometry_are_named_and_many_are_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    entries = procedural_catalog(tmp_path, ["Microwave"], 7, 0, seed=0)
+    for entry in entries[:6]:
+        urdf = entry.folder / "mobility.urdf"
+        urdf.write_text(urdf.read_text().replace("<visual", "<visual><geometry><box/></geometry></visual><visual", 1))
+    (entries[6].folder / "semantics.txt").unlink()  # no geometry
+    loaded = partnet_catalog(str(tmp_path), "all")
+    lost = lost_geometry(entry.load() for entry in loaded)
+    assert set(lost) == {entry.id for entry in entries[:6]}
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == 6 and all("<box> in place of a mesh" in line for line in told[:5])
+    assert [line.split()[1].strip(":") for line in told[:5]] == list(lost)[:5] and "1 more" in told[5]
+    caplog.clear()
+    folder_entries(entries[0].folder)[0].load()  # as launch/view.py does
+    assert [record.getMessage() for record in caplog.records] == told[:1]
 
 
 def test_another_seed_makes_other_objects(tmp_path: Path) -> None:

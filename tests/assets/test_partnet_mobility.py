@@ -108,7 +108,18 @@ def test_meshes_stand_in_their_links_frame(tmp_path: Path) -> None:
     (collision,) = obj.links[obj.index("knob")].collisions
     np.testing.assert_allclose(visual.vertices, turn.apply(vertices * [2, -1, 0.5]) + [0.5, -1, 2], atol=1e-12)
     np.testing.assert_allclose(collision.vertices, turn.apply(vertices) + [0.5, -1, 2], atol=1e-12)
-    np.testing.assert_array_equal(visual.faces, [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(collision.faces, [[0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(visual.faces, [[2, 1, 0], [3, 2, 0]])  # its scale mirrors
+
+
+@pytest.mark.parametrize("scale", ["1 1 1", "-1 2 1", "1 -1 -0.5", "-1 -1 -1"])
+def test_a_solid_stays_a_solid_whatever_its_scale(tmp_path: Path, scale: str) -> None:
+    box = trimesh.creation.box((1, 2, 3)).export(file_type="obj")
+    urdf = GOOD.replace('a.obj"/>', f'a.obj" scale="{scale}"/>')
+    knob = (obj := load_object(write(tmp_path / "a", urdf, box))).links[obj.index("knob")]
+    for mesh in (*knob.visuals, *knob.collisions):
+        volume = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume
+        assert volume == pytest.approx(6.0 * abs(np.prod([float(word) for word in scale.split()])))
 
 
 def test_what_is_looked_at_has_each_point_and_triangle_once(tmp_path: Path) -> None:
@@ -134,6 +145,41 @@ def test_flaws_that_do_no_harm_are_named_and_dropped(tmp_path: Path) -> None:
         assert any(word in entry for entry in obj.dropped)
     flat = load_object(write(tmp_path / "b", mesh="v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"))
     assert not any(x.visuals for x in flat.links) and any("a.obj" in entry for entry in flat.dropped)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("<visual>", "<visual><geometry><box/></geometry></visual><visual>", "1 visual of knob: <box> in place"),
+        ("<collision>", 2 * "<collision><geometry><sphere/></geometry></collision>" + "<collision>",
+         "2 collisions of knob: <sphere> in place"),
+        ("<visual>", "<visual/><visual>", "1 visual of knob: no shape"),
+        ("</geometry>", "<cylinder/></geometry>", "1 visual of knob: <cylinder>"),
+        ('a.obj"/>', 'a.obj" scale="1 0 0"/>', "a.obj: no surface"),
+    ],
+)  # fmt: skip
+def test_geometry_that_is_lost_is_told_from_harmless_flaws(tmp_path: Path, old: str, new: str, says: str) -> None:
+    folder = write(tmp_path / "a", GOOD.replace(old, new, 1))
+    (folder / "semantics.txt").unlink()
+    obj = load_object(folder)
+    assert len(obj.lost) == 1 and says in obj.lost[0]
+    assert sorted(obj.dropped) == sorted([*obj.lost, "semantics.txt: missing"])
+
+
+def test_an_object_without_a_mesh_is_skipped_by_name(tmp_path: Path) -> None:
+    urdf = re.sub(r"<mesh [^>]*/>", '<box size="1 1 1"/>', GOOD)
+    objects, skipped = load_objects([write(tmp_path / "good"), write(tmp_path / "boxes", urdf)])
+    assert [obj.id for obj in objects] == ["good"]
+    (boxes,) = skipped
+    for words in ("object boxes: no link has a visual mesh", "<box> in place of a mesh", "and 5 more"):
+        assert words in boxes.reason
+
+
+def test_triangles_are_remarked_and_kept(tmp_path: Path) -> None:
+    obj = load_object(write(tmp_path / "a", mesh="v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 2 0\nf 1 2 4\n"))
+    assert all(link.collisions for link in obj.links if link.name != "base")
+    (remark,) = obj.dropped
+    assert "a.obj" in remark and "plate" in remark and not obj.lost
 
 
 def test_missing_side_files_leave_names_empty(tmp_path: Path) -> None:
@@ -273,6 +319,10 @@ def test_a_decomposed_part_collides_piece_by_piece(tmp_path: Path) -> None:
     assert obj.joint_of(obj.index("door")).limits == (-0.25, 1.25)
     assert len(door.visuals) == 1 and len(door.collisions) == 2
     assert sorted(len(mesh.vertices) for mesh in door.collisions) == [4, 4]
+    # A third piece has no volume.
+    three = load_object(write(folder, mesh=two + "v 9 0 0\nv 9 1 0\nv 9 0 1\nf 9 10 11\n"))
+    assert len(three.links[three.index("door")].collisions) == 3 and "plate" in three.dropped[0]
+    write(folder, mesh=two)
     (folder / "mobility_cvx.urdf").unlink()
     whole = load_object(folder)
     assert len(whole.links[whole.index("door")].collisions) == 1

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import sapien
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from tensordict import TensorDict
 
@@ -367,6 +368,47 @@ def test_a_trial_that_is_won_from_the_start_is_refused(
     obj = objects["Oven"]
     with pytest.raises(UserError, match="fully open"):
         env.reset(options={"trials": [dataclasses.replace(default_trial(obj), start=tuple(obj.limits[:, 1]))]})
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        ({"num_envs": 2}, "num_envs=2 needs a CUDA device"),
+        ({"num_envs": 2, "sim_backend": "physx_cpu"}, "num_envs=2 needs CUDA"),
+        ({"num_envs": 0}, "num_envs=0"),
+        ({"sim_backend": "gpu"}, "sim_backend=gpu needs a CUDA device"),
+        ({"sim_backend": "cuda:1"}, "sim_backend=cuda:1 needs a CUDA device"),
+        ({"sim_backend": "warp"}, "sim_backend='warp' is none; choose from auto, "),
+        ({"render_backend": "gpu"}, "render_backend=gpu needs Vulkan"),
+        ({"render_backend": "opengl"}, "render_backend='opengl' is none; choose from"),
+        ({"render_mode": "human"}, "render_mode=human needs Vulkan"),
+        ({"render_mode": "sensors"}, "render_mode=sensors needs Vulkan"),
+        ({"render_mode": "ascii"}, "render_mode='ascii' is none of this task's; choose from human, "),
+        ({"obs_mode": "rgbd", "render_backend": "none"}, "obs_mode=rgbd needs a renderer"),
+        ({"obs_mode": "sound"}, "obs_mode='sound' is none"),
+        ({"reward_mode": "dense"}, "reward_mode='dense' is none"),
+    ],
+)
+def test_what_is_not_there_is_refused_in_a_sentence(
+    objects: dict[str, ArticulatedObject], monkeypatch: pytest.MonkeyPatch, asked: dict, words: str
+) -> None:
+    def nothing(device: str) -> None:
+        raise RuntimeError(f'failed to find device "{device}"')
+
+    monkeypatch.setattr("fb3d_rl.camera.sapien._renderer", nothing)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError) as error:
+        OpenArticulatedEnv([objects["Table"]], EnvOptions(points=POINTS), **asked)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_window_that_cannot_be_opened_is_named(env: OpenArticulatedEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_screen(self: object) -> None:
+        raise RuntimeError("Create window failed")
+
+    monkeypatch.setattr(BaseEnv, "render_human", no_screen)
+    with pytest.raises(UserError, match="screen"):
+        env.render_human()
 
 
 def test_an_environment_without_objects_is_refused() -> None:

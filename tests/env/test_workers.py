@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 from functools import partial
+from typing import Literal
 
 import pytest
 import torch
@@ -195,6 +196,17 @@ def test_what_keeps_workers_from_starting_is_raised(trials: list[Trial]) -> None
     ):
         run(workers, trials)
     assert multiprocessing.active_children() == before
+
+
+def fall_over() -> TrialEnv:
+    raise RuntimeError("no such device")
+
+
+@pytest.mark.parametrize("backend", ["direct", pytest.param("process", marks=pytest.mark.slow)])
+def test_trials_that_no_worker_can_run_say_why(backend: Literal["direct", "process"], trials: list[Trial]) -> None:
+    with Workers(fall_over, Policy("exception"), CollectorOptions(backend, 2), HORIZON) as workers:
+        episodes = run(workers, trials)
+    assert all("not run" in episode.error and "no such device" in episode.error for episode in episodes)
 
 
 @pytest.mark.usefixtures("two_threads")

@@ -54,7 +54,9 @@ def fill(run: Path) -> list[TrialRow]:
     flow = [FlowRow(row.object, row.category, row.split, row.link, 0.8, 0.2, 0.1) for row in rows]
     write_trials(run / "rows.csv", rows)
     write_flow(run / "flow_rows.csv", flow)
-    numbers = summary(rows, flow, {"seed": 5, "git_revision": "cafe01", "command": f"train {EVIL}"})
+    lost = {"object-3": ["2 visuals of base: <box> in place of a mesh", EVIL]}
+    facts = {"seed": 5, "git_revision": "cafe01", "command": f"train {EVIL}", "lost_geometry": lost}
+    numbers = summary(rows, flow, facts)
     (run / "summary.json").write_text(json.dumps(numbers))
     (run / "config.yaml").write_text(f"name: {EVIL}\n")
     log = [{"step": i, "train/loss": 1 / (i + 1), "val/cosine": float("nan") if i == 3 else 0.5} for i in range(9)]
@@ -153,6 +155,11 @@ def test_numbers_and_facts_are_on_the_page(page: Page) -> None:
     shown = " ".join(page.text)
     for word in ("cafe01", "0.80", "29 %", "artflownet", "expert", "class mean", "instance mean"):
         assert word in shown, word
+
+
+def test_lost_geometry_is_on_the_page(page: Page) -> None:
+    content = " ".join(page.text)
+    assert "Geometry left out while reading" in content and "2 visuals of base: <box> in place of a mesh" in content
 
 
 def test_the_viewer_holds_the_visible_clouds(page: Page) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import time
@@ -10,13 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets import procedural
-from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import SampleOptions
@@ -59,6 +61,17 @@ class Policy(TensorDictModuleBase):
         self.calls += 1
         td["action"] = self.act(self.calls)[None]
         return td
+
+
+class Still(Policy):
+    """Stands still; can be pickled."""
+
+    def __init__(self) -> None:
+        super().__init__(_zeros)
+
+
+def _zeros(call: int) -> torch.Tensor:
+    return torch.zeros(8)
 
 
 def test_the_expert_opens_and_repeats_bit_for_bit(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
@@ -108,6 +121,26 @@ def test_a_crash_costs_its_own_trial_only(objects: list[ArticulatedObject], tria
     assert len(rows) == len(trials)
     assert [row.status for row in rows] == ["ok", "error", *["ok"] * (len(trials) - 2)]
     assert "the network fell over" in rows[1].error and rows[1].normalized_distance == 1.0
+
+
+@pytest.mark.parametrize("backend", ["direct", pytest.param("process", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("broken", ["first", "all"])
+def test_an_object_that_cannot_be_built_costs_its_own_trials_only(
+    backend: Literal["direct", "process"], broken: str, objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    """From the first trial on: no worker needs an object to start."""
+    endless = Mesh(np.full((4, 3), np.nan), np.array([[0, 1, 2], [0, 2, 3]]))
+    names = {trials[0].trial.object} if broken == "first" else {item.trial.object for item in trials}
+
+    def spoiled(obj: ArticulatedObject) -> ArticulatedObject:
+        links = tuple(dataclasses.replace(link, collisions=(endless,)) for link in obj.links)
+        return dataclasses.replace(obj, links=links) if obj.id in names else obj
+
+    options = EnvOptions(points=300, camera=CAMERA, horizon=3)
+    rows = run_trials("still", Still(), [spoiled(obj) for obj in objects], trials, options,
+                      collector=CollectorOptions(backend, 1))  # fmt: skip
+    assert [row.status == "error" for row in rows] == [item.trial.object in names for item in trials]
+    assert all(row.error and "not run" not in row.error for row in rows if row.status == "error")
 
 
 class Deadly(TensorDictModuleBase):
