@@ -7,7 +7,7 @@ import platform
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import torch
 import yaml
@@ -33,6 +33,8 @@ from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
     from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, ViewConfig
+
+Config = TypeVar("Config", bound="CommandConfig")
 
 
 def train_entries(assets: AssetsConfig, out: Path, seed: int) -> tuple[list[Entry], list[Entry]]:
@@ -120,9 +122,24 @@ def sample_options(cfg: CommandConfig) -> SampleOptions:
     )
 
 
+def settled(cfg: Config, part_mask_input: bool | None = None) -> Config:
+    """The configuration with values for policy.mask and env.suction.hold where they are null.
+
+    Args:
+        cfg: the configuration.
+        part_mask_input: whether the network that acts was trained with the mask; None for the one that ``cfg`` trains,
+            if it does.
+    """
+    if part_mask_input is None:
+        part_mask_input = getattr(getattr(cfg, "algo", None), "part_mask_input", True)
+    mask = cfg.policy.mask or ("target" if part_mask_input else "none")
+    suction = replace(cfg.env.suction, hold=cfg.env.suction.hold or ("any" if mask == "none" else "target"))
+    return replace(cfg, policy=replace(cfg.policy, mask=mask), env=replace(cfg.env, suction=suction))
+
+
 def env_options(cfg: CommandConfig) -> EnvOptions:
     """The task's constants."""
-    env = cfg.env
+    env = settled(cfg).env
     kind = cast(Literal["raycast", "sapien"], cfg.camera.kind)
     return EnvOptions(
         gripper=GripperOptions(**asdict(env.gripper)),
@@ -142,8 +159,10 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
 
 
 def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
-    """Speeds and distances of the flow policy."""
-    return FlowPolicyOptions(**asdict(cfg.policy.flow), contact=ContactOptions(**asdict(cfg.policy.contact)))
+    """Speeds, distances and times of the flow policy, and the mask that it sees."""
+    policy = settled(cfg).policy
+    mask = cast(Literal["target", "none"], policy.mask)
+    return FlowPolicyOptions(**asdict(policy.flow), mask=mask, contact=ContactOptions(**asdict(policy.contact)))
 
 
 def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
@@ -179,8 +198,13 @@ def protocol(cfg: CommandConfig) -> Protocol:
     )
 
 
-def evaluation_protocol(cfg: EvaluateConfig, out: Path) -> Protocol:
+def evaluation_protocol(cfg: EvaluateConfig, out: Path, part_mask_input: bool | None = None) -> Protocol:
     """What launch/evaluate.py evaluates.
+
+    Args:
+        cfg: the configuration.
+        out: the run folder.
+        part_mask_input: as of :func:`settled`.
 
     Raises:
         UserError: as :func:`protocol`; or it is to go on from an evaluation with other settings.
@@ -194,7 +218,7 @@ def evaluation_protocol(cfg: EvaluateConfig, out: Path) -> Protocol:
                     f"{out} was begun with {key}={before.get(key)}, not {value}; resume with the same settings, or "
                     "choose another folder: hydra.run.dir=DIR"
                 )
-    return replace(protocol(cfg), resume=cfg.resume)
+    return replace(protocol(settled(cfg, part_mask_input)), resume=cfg.resume)
 
 
 def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -30,7 +30,7 @@ from fb3d_rl.evaluation.rows import (
     TrialRow,
 )
 from fb3d_rl.evaluation.trials import Scheduled
-from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.flow_policy import MASK, FlowPolicy
 from fb3d_rl.policies.hand import VelocityLimits
 
 KEYS: tuple[Key, ...] = (
@@ -40,6 +40,7 @@ KEYS: tuple[Key, ...] = (
     ("next", "success"),
     ("next", "normalized_distance"),
     ("next", "contact"),
+    ("next", "held_opened"),
     ("next", "observation", "attached"),
     ("next", "observation", "contact_force"),
 )
@@ -132,7 +133,7 @@ def run_trials(
     timed = TimedPolicy(policy, limit)
     with Workers(create, timed, collector or CollectorOptions(), options.horizon) as workers:
         for episode in workers.run([item.trial for item in scheduled], KEYS):
-            row = _row(episode, name, scheduled[episode.index], options)
+            row = _row(episode, name, mask_of(policy), scheduled[episode.index], options)
             if timing is not None and episode.frames is not None:
                 timing += episode.frames[DECISION].flatten().tolist()
             rows[episode.index] = row
@@ -145,7 +146,13 @@ def create_env(objects: Sequence[ArticulatedObject], options: EnvOptions, state:
     return policy_env(make_env(objects, options), state)
 
 
-def _row(episode: Episode, name: str, item: Scheduled, options: EnvOptions) -> TrialRow:
+def mask_of(policy: TensorDictModuleBase) -> str:
+    """Whether a policy sees which points are the part's: "target" or "none"; "" if it sees no points."""
+    keys = set(policy.in_keys)
+    return "target" if MASK in keys else "none" if ("observation", "points") in keys else ""
+
+
+def _row(episode: Episode, name: str, mask: str, item: Scheduled, options: EnvOptions) -> TrialRow:
     trial = item.trial
     if episode.frames is None:
         failure = TOO_SLOW if episode.error.startswith(TookTooLong.__name__) else CRASHED
@@ -154,7 +161,8 @@ def _row(episode: Episode, name: str, item: Scheduled, options: EnvOptions) -> T
         outcome = _outcome(episode.frames, options.control_freq)
     return TrialRow(
         trial=episode.index, policy=name, object=trial.object, category=item.category, split=item.split, link=item.link,
-        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, repeat=item.repeat, **outcome,
+        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, repeat=item.repeat, mask=mask,
+        **outcome,
     )  # fmt: skip
 
 
@@ -174,6 +182,7 @@ def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
         failure="" if success else _failure(after, len(held) > 0, control_freq),
         seconds=len(after) / control_freq,
         path_length=float(tips.double().diff(dim=0).norm(dim=1).sum()),
+        held_opened=bool(after["held_opened"].any()),
         lost=int((attached[:-1] & ~attached[1:]).sum()),
     )
 

@@ -62,10 +62,14 @@ class TrialRow:
         seconds: simulated time until success, else until the end, s; -1 if it was not recorded.
         path_length: way of the suction tip, m; -1 if it was not recorded.
         lost: how often the part was held and then was not; -1 if it was not recorded.
+        mask: whether the policy saw which points are the part's, "target" or "none"; "" if it sees no points, or if it
+            was not recorded.
+        held_opened: at some time a part that suction had held was open, by the same rule from its own start: the target
+            or, where suction holds any part, another one.
 
     Raises:
-        ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success
-            or a normalized distance other than 1: a crash counts as a failure.
+        ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success, an
+            opened part or a normalized distance other than 1: a crash counts as a failure.
     """
 
     trial: int
@@ -89,13 +93,16 @@ class TrialRow:
     seconds: float = -1.0
     path_length: float = -1.0
     lost: int = -1
+    mask: str = ""
+    held_opened: bool = False
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):
             raise ValueError(f'status is {self.status!r}, not "ok" or "error"')
         if not math.isfinite(self.normalized_distance):
             raise ValueError(f"normalized_distance is {self.normalized_distance}")
-        if self.status == "error" and (self.contact or self.success or self.normalized_distance != 1.0):
+        claims = self.contact or self.success or self.held_opened or self.normalized_distance != 1.0
+        if self.status == "error" and claims:
             raise ValueError("a crashed trial counts as a failure: no contact, no success, distance 1")
 
 

@@ -49,7 +49,9 @@ def test_an_empty_table_still_has_its_header(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "claim", [{"contact": True}, {"success": True}, {"normalized_distance": 0.0}], ids=lambda c: next(iter(c))
+    "claim",
+    [{"contact": True}, {"success": True}, {"held_opened": True}, {"normalized_distance": 0.0}],
+    ids=lambda c: next(iter(c)),
 )
 def test_a_crashed_trial_cannot_claim_anything(claim: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="crashed"):
@@ -84,7 +86,7 @@ def test_files_of_earlier_versions_lack_what_came_later(tmp_path: Path) -> None:
     write_trials(path, [trial(contact=True, repeat=2, seconds=7.5, path_length=1.25, lost=1)])
     assert read_trials(path)[0].path_length == 1.25
     rows = list(csv.reader(path.read_text().splitlines()))
-    path.write_text("".join(",".join(row[:-4]) + "\n" for row in rows))
+    path.write_text("".join(",".join(row[:-6]) + "\n" for row in rows))
     assert read_trials(path) == [trial(contact=True)]
     path.write_text("".join(",".join(row[1:]) + "\n" for row in rows))
     with pytest.raises(UserError, match="columns"):
