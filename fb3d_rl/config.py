@@ -225,9 +225,13 @@ class GripperConfig:
 
 @dataclass
 class SuctionConfig:
-    """fb3d_rl.env.options.SuctionOptions."""
+    """fb3d_rl.env.options.SuctionOptions.
 
-    hold: str
+    Attributes:
+        hold: null for "target", or "any" where policy.mask is "none".
+    """
+
+    hold: str | None
     stiffness: float
     damping: float
     angular_damping: float
@@ -307,9 +311,15 @@ class ContactConfig:
 
 @dataclass
 class PolicyConfig:
-    """The flow policy; ``name`` chooses where the flow comes from."""
+    """The flow policy; ``name`` chooses where the flow comes from.
+
+    Attributes:
+        mask: which points it is told to act on: "target", those of the part to open, or "none", whatever has a flow
+            (the paper's "without mask"); null for "none" with a network that was trained so, else "target".
+    """
 
     name: str
+    mask: str | None
     flow: FlowConfig
     contact: ContactConfig
 
@@ -423,6 +433,10 @@ TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
 """What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""
 
 
+MASKLESS = ("expert", "random", "artflownet")
+"""Policies that can do without the mask of the part to open."""
+
+
 @dataclass
 class ViewConfig(CommandConfig):
     """Everything that launch/view.py needs.
@@ -450,7 +464,8 @@ def validate(cfg: CommandConfig) -> None:
     _one_of("collector.backend", cfg.collector.backend, ("direct", "process", "ray"))
     _at_least("collector.workers", 1 if cfg.collector.workers is None else cfg.collector.workers, 1)
     _at_least("collector.restarts", cfg.collector.restarts, 0)
-    _one_of("env.suction.hold", cfg.env.suction.hold, ("target", "any"))
+    if cfg.env.suction.hold is not None:
+        _one_of("env.suction.hold", cfg.env.suction.hold, ("target", "any"))
     _one_of("camera.kind", cfg.camera.kind, ("raycast", "sapien"))
     _one_of("camera.shader", cfg.camera.shader, ("minimal", "default"))
     _one_of("device", cfg.device, ("auto", "cpu", "cuda"))
@@ -460,6 +475,8 @@ def validate(cfg: CommandConfig) -> None:
         _one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         if isinstance(cfg.algo, ArtFlowNetConfig):
             _validate_artflownet(cfg.algo)
+            if cfg.policy.mask == "none" and cfg.algo.name in MASKLESS and cfg.algo.part_mask_input:
+                raise UserError("policy.mask=none keeps the mask from the network too: give algo.part_mask_input=false")
         elif isinstance(cfg.algo, ImitationConfig):
             _validate_imitation(cfg.algo, cfg.collector, cfg.data.labels)
         _at_least("data.train_samples", cfg.data.train_samples, 1)
@@ -494,6 +511,8 @@ def validate(cfg: CommandConfig) -> None:
     if cfg.evaluation.decision_seconds is not None:
         _positive("evaluation.decision_seconds", cfg.evaluation.decision_seconds)
     acting = cfg.algo.name if isinstance(cfg, TrainConfig) else cfg.policy.name
+    if cfg.policy.mask == "none" and acting not in MASKLESS:
+        raise UserError(f"{acting} has to see which part to open: leave policy.mask=target")
     if cfg.evaluation.goal == "state" and acting in ("bc", "dagger"):
         raise UserError(f"{acting} learns to open only; evaluation.goal=state is for policies of a flow")
     for key in ("closed_share", "others_closed", "all_parts_share", "some_parts_share"):
@@ -516,6 +535,8 @@ def validate(cfg: CommandConfig) -> None:
 
 def _validate_policy(policy: PolicyConfig) -> None:
     flow, contact = policy.flow, policy.contact
+    if policy.mask is not None:
+        _one_of("policy.mask", policy.mask, ("target", "none"))
     for key in ("travel_speed", "approach_speed", "touch_speed", "pull_speed", "angular_gain", "precontact", "line",
                 "overshoot", "nearby"):  # fmt: skip
         _positive(f"policy.flow.{key}", getattr(flow, key))

@@ -90,6 +90,7 @@ GROUPS: dict[str, dict[Key, Entry]] = {
     "metrics": {
         "normalized_distance": Entry((1,), F32, "|q_goal - q| / |q_goal - q_start|"),
         "contact": Entry((1,), BOOL, "suction has held the target part in this episode"),
+        "held_opened": Entry((1,), BOOL, "a part that suction has held, the target or another, is open"),
     },
     "sample": {},
 }

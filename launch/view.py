@@ -19,6 +19,7 @@ def task(cfg: Any, out: Path) -> None:
     require_viser()
     device = setup.choose_device(cfg.device)
     net = load_network(cfg.checkpoint).to(device) if cfg.checkpoint else None
+    cfg = setup.settled(cfg, net.part_mask_input if net else None)
     with tempfile.TemporaryDirectory() as folder:
         obj = setup.one_object(cfg, Path(folder))
     session = Session(

@@ -6,7 +6,7 @@ So do the other algorithms of :mod:`fb3d_rl.algos.kinds` with their networks.
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -95,11 +95,13 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES)
     if met_by is not None:
         loaded, count = [entry.load() for entry in train], cfg.data.met_samples
-        acting = artflownet_policy(met_by, limits, speeds)
-        made_by = {"weights": met_by.digest(), "policy": asdict(speeds)}
+        own = setup.settled(replace(cfg, policy=replace(cfg.policy, mask=None)), met_by.part_mask_input)
+        met_speeds, meeting = setup.flow_policy_options(own), replace(protocol, env=setup.env_options(own))
+        acting = artflownet_policy(met_by, limits, met_speeds)
+        made_by = {"weights": met_by.digest(), "policy": asdict(met_speeds)}
         with progress_bars() as bar:
             task = bar.add_task("clouds met", total=count)
-            meet_samples(out / MET, loaded, acting, count, protocol, made_by, lambda n: bar.update(task, completed=n))
+            meet_samples(out / MET, loaded, acting, count, meeting, made_by, lambda n: bar.update(task, completed=n))
     wait_for_all()
     buffer = training_rows(cfg, out)
     validation = validation_samples(entries.validation, samples, cfg.seed)
@@ -270,10 +272,11 @@ def load_trained(path: str | Path, name: str) -> CloudNetwork:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate the expert, a baseline that learns nothing, or what a trained network does, beside the expert."""
-    protocol = setup.protocol(cfg)
-    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     name, kind = cfg.policy.name, KINDS.get(cfg.policy.name)
     net = load_trained(cfg.checkpoint, name) if kind and cfg.checkpoint else None
+    cfg = setup.settled(cfg, net.part_mask_input if net else None)
+    protocol = setup.protocol(cfg)
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     policies: dict[str, Any] = {}
     if name == "expert" or cfg.evaluation.expert:

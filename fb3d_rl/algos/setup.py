@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 import torch
 
@@ -42,6 +42,8 @@ from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
     from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, TrainConfig, ViewConfig
+
+Config = TypeVar("Config", bound="CommandConfig")
 
 
 @dataclass(frozen=True)
@@ -143,9 +145,24 @@ def sample_options(cfg: CommandConfig) -> SampleOptions:
     )
 
 
+def settled(cfg: Config, part_mask_input: bool | None = None) -> Config:
+    """The configuration with values for policy.mask and env.suction.hold where they are null.
+
+    Args:
+        cfg: the configuration.
+        part_mask_input: whether the network that acts was trained with the mask; None for the one that ``cfg`` trains,
+            if it does.
+    """
+    if part_mask_input is None:
+        part_mask_input = getattr(getattr(cfg, "algo", None), "part_mask_input", True)
+    mask = cfg.policy.mask or ("target" if part_mask_input else "none")
+    suction = replace(cfg.env.suction, hold=cfg.env.suction.hold or ("any" if mask == "none" else "target"))
+    return replace(cfg, policy=replace(cfg.policy, mask=mask), env=replace(cfg.env, suction=suction))
+
+
 def env_options(cfg: CommandConfig) -> EnvOptions:
     """The task's constants."""
-    env = cfg.env
+    env = settled(cfg).env
     kind = cast(Literal["raycast", "sapien"], cfg.camera.kind)
     return EnvOptions(
         gripper=GripperOptions(**asdict(env.gripper)),
@@ -165,8 +182,10 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
 
 
 def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
-    """Speeds and distances of the flow policy."""
-    return FlowPolicyOptions(**asdict(cfg.policy.flow), contact=ContactOptions(**asdict(cfg.policy.contact)))
+    """Speeds, distances and times of the flow policy, and the mask that it sees."""
+    policy = settled(cfg).policy
+    mask = cast(Literal["target", "none"], policy.mask)
+    return FlowPolicyOptions(**asdict(policy.flow), mask=mask, contact=ContactOptions(**asdict(policy.contact)))
 
 
 def velocity_limits(cfg: CommandConfig) -> VelocityLimits:

@@ -198,6 +198,17 @@ class Stage:
         self.direction = torch.zeros(len(obj.movable), dtype=torch.float64)
         self.direction[self.target] = self.sign
 
+    def goals(self) -> NDArray[np.float64]:
+        """Positions [J] (rad or m) in which each part counts as open, for the part to open its goal.
+
+        Not a number where a joint opens nothing, or starts fully open.
+        """
+        goals = self.model.opened.copy()
+        goals[self.target] = self.goal
+        opens = np.isin(self.object.movable, self.model.links) & (np.abs(goals - np.array(self.trial.start)) > 1e-6)
+        opens[self.target] = True
+        return np.where(opens, goals, np.nan)
+
     @property
     def object(self) -> ArticulatedObject:
         """The object."""

@@ -351,12 +351,13 @@ class OpenArticulatedEnv(BaseEnv):
         stages = [self.stages[e] for e in env_idx.tolist()]
         own = self.agent.robot.links_map
         if len(stages) == self.num_envs:
-            self._contact = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+            shape = self._columns.shape
+            self._held = torch.zeros(shape, dtype=torch.bool, device=self.device)
             self._force = torch.zeros(self.num_envs, 1, device=self.device)
             self._camera_position = torch.zeros(self.num_envs, 3, device=self.device)
             self._target = torch.zeros(self.num_envs, 1, dtype=torch.int64, device=self.device)
-            self._start, self._goal = torch.zeros(2, self.num_envs, 1, device=self.device)
-            self._opens = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
+            self._start, self._goal = torch.full((2, *shape), torch.nan, device=self.device)
+            self._opens = torch.ones(shape, dtype=torch.bool, device=self.device)
             self._prismatic = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         state = torch.zeros(len(stages), int(self.articulation.max_dof))
         hand = torch.zeros(len(stages), ACTION_DIM)
@@ -366,10 +367,12 @@ class OpenArticulatedEnv(BaseEnv):
             start_position = self.options.gripper.start(stage.model.bounds(stage.trial.start))
             hand[row, :3] = torch.from_numpy(start_position)
             self._camera_position[e] = torch.as_tensor(stage.model.camera.pose(stage.trial.view)[:3, 3])
-            self._target[e], self._start[e], self._goal[e] = stage.target, start[stage.target], stage.goal
-            self._opens[e] = stage.trial.goal is None
+            self._target[e], self._held[e], self._opens[e] = stage.target, False, True
+            self._opens[e, stage.target] = stage.trial.goal is None
+            self._start[e, : len(start)] = start
+            self._goal[e, : len(start)] = torch.from_numpy(stage.goals())
             self._prismatic[e] = stage.object.joint_of(stage.trial.link).type == "prismatic"
-            self._contact[e], self._force[e] = False, 0.0
+            self._force[e] = 0.0
             if hasattr(stage, "suction"):
                 stage.suction.release()
             stage.suction = Suction(
@@ -433,9 +436,9 @@ class OpenArticulatedEnv(BaseEnv):
             contacts = [stage.suction.contacts() for stage in self.stages]
         for e, stage in enumerate(self.stages):
             stage.suction.update(contacts[e])
-            held = stage.suction.held
-            if held is not None and bool(stage.moved[held]):
-                self._contact[e] = True
+            if stage.suction.held is not None:
+                carried = stage.tree.descendants[:, stage.suction.held]
+                self._held[e, : len(carried)] |= carried.to(self.device)
 
     def _after_control_step(self) -> None:
         for e, stage in enumerate(self.stages):
@@ -446,15 +449,20 @@ class OpenArticulatedEnv(BaseEnv):
         return self.articulation.get_qpos().gather(1, self._columns)
 
     def evaluate(self) -> dict[str, Tensor]:
-        """Metrics: normalized_distance [E, 1], contact [E, 1] (suction has held the part) and success [E]."""
-        self._position = self.joint_positions().gather(1, self._target)
-        signed = (self._goal - self._position) / (self._goal - self._start)
+        """Metrics: normalized_distance [E, 1], contact [E, 1] (suction has held the part), held_opened [E, 1] (a part
+        that suction has held is open, be it the one to open or another) and success [E].
+        """
+        positions = self.joint_positions()
+        self._position = positions.gather(1, self._target)
+        signed = (self._goal - positions) / (self._goal - self._start)
         # Past the limit, by the solver's slack, a part is open; past a goal within the range it has missed it.
-        distance = torch.where(self._opens, signed.clamp_min(0.0), signed.abs())
+        distances = torch.where(self._opens, signed.clamp_min(0.0), signed.abs())
+        opened = distances < self.options.success  # not a number, and so not open, where there is nothing to open
         return {
-            "normalized_distance": distance,
-            "contact": self._contact.clone(),
-            "success": (distance < self.options.success)[:, 0],
+            "normalized_distance": distances.gather(1, self._target),
+            "contact": self._held.gather(1, self._target),
+            "held_opened": (opened & self._held).any(-1, keepdim=True),
+            "success": opened.gather(1, self._target)[:, 0],
         }
 
     def get_info(self) -> dict[str, Any]:
@@ -571,14 +579,14 @@ class OpenArticulatedEnv(BaseEnv):
     # ------------------------------------------------------------------------------------------------ state
 
     def get_state_dict(self) -> dict[str, Any]:
-        """The simulation's state, with suction [E, 7] and the episode's counters [E, 3]."""
+        """The simulation's state, with suction [E, 7] and the episode's steps, force and held joints [E, 2 + J]."""
         state: dict[str, Any] = super().get_state_dict()
         springs = [
             np.concatenate([[-1 if s.suction.held is None else s.suction.held], *s.suction.anchors])
             for s in self.stages
         ]
         state["suction"] = torch.as_tensor(np.stack(springs), dtype=torch.float32, device=self.device)
-        state["episode"] = torch.cat([self._elapsed_steps[:, None], self._contact, self._force], dim=-1)
+        state["episode"] = torch.cat([self._elapsed_steps[:, None], self._force, self._held], dim=-1)
         return state
 
     def set_state_dict(self, state: dict[str, Any], env_idx: Tensor | None = None) -> None:
@@ -596,9 +604,9 @@ class OpenArticulatedEnv(BaseEnv):
             suction.release()
             if held[0] >= 0:
                 suction.hold(int(held[0]), on_tool, on_part)
-            elapsed, contact, force = state["episode"][row]
-            self._elapsed_steps[e] = elapsed.to(self._elapsed_steps.dtype)
-            self._contact[e], self._force[e] = contact.bool(), force
+            elapsed, force, held_before = state["episode"][row].tensor_split([1, 2])
+            self._elapsed_steps[e] = elapsed[0].to(self._elapsed_steps.dtype)
+            self._force[e], self._held[e] = force, held_before.bool()
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore a flat state [E, D] of ``get_state()``, taken in the same trials."""

@@ -15,7 +15,7 @@ from fb3d_rl.evaluation.page import text
 from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.evaluation.rows import policies as policies_in
 from fb3d_rl.evaluation.runs import Run, read_run
-from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, MOTION_ONLY, SUCCESS, Metric
+from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, HELD, MOTION_ONLY, SUCCESS, Metric
 
 LOST_GEOMETRY = "lost_geometry"
 """Key of a summary: what the run's objects lost in reading, by their ids."""
@@ -91,7 +91,8 @@ def _headline(numbers: Mapping[str, Any]) -> str:
         if numbers[prefix + "n_error"]:
             counts += f", {numbers[prefix + 'n_error']} crashed"
         blocks.append(f"<h3>{text(policy)} · {counts}</h3>")
-        blocks.append(page.cards(_card(m, numbers, prefix) for m in (SUCCESS, CONTACT, DISTANCE, MOTION_ONLY)))
+        shown = [SUCCESS, *([HELD] if policy in tables.unmasked(numbers) else []), CONTACT, DISTANCE, MOTION_ONLY]
+        blocks.append(page.cards(_card(m, numbers, prefix) for m in shown))
     if not blocks:
         return ""
     return "".join(blocks) + page.facts(terms([numbers]))

@@ -32,7 +32,7 @@ from fb3d_rl.evaluation.rows import (
 )
 from fb3d_rl.evaluation.trials import Scheduled, trial_key
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.flow_policy import MASK, FlowPolicy
 from fb3d_rl.policies.hand import VelocityLimits
 
 KEYS: tuple[Key, ...] = (
@@ -42,6 +42,7 @@ KEYS: tuple[Key, ...] = (
     ("next", "success"),
     ("next", "normalized_distance"),
     ("next", "contact"),
+    ("next", "held_opened"),
     ("next", "observation", "attached"),
     ("next", "observation", "contact_force"),
 )
@@ -138,7 +139,7 @@ def run_trials(
         for episode in workers.run([item.trial for item in scheduled], KEYS):
             item = scheduled[episode.index]
             row = replace(
-                _row(episode, name, item, options),
+                _row(episode, name, mask_of(policy), item, options),
                 key=trial_key(named[item.trial.object], item.trial, options.suction.hold),
                 policy_digest=acting,
             )
@@ -154,7 +155,13 @@ def create_env(objects: Sequence[ArticulatedObject], options: EnvOptions, state:
     return policy_env(make_env(objects, options), state)
 
 
-def _row(episode: Episode, name: str, item: Scheduled, options: EnvOptions) -> TrialRow:
+def mask_of(policy: TensorDictModuleBase) -> str:
+    """Whether a policy sees which points are the part's: "target" or "none"; "" if it sees no points."""
+    keys = set(policy.in_keys)
+    return "target" if MASK in keys else "none" if ("observation", "points") in keys else ""
+
+
+def _row(episode: Episode, name: str, mask: str, item: Scheduled, options: EnvOptions) -> TrialRow:
     trial = item.trial
     if episode.frames is None:
         failure = TOO_SLOW if episode.error.startswith(TookTooLong.__name__) else CRASHED
@@ -163,7 +170,8 @@ def _row(episode: Episode, name: str, item: Scheduled, options: EnvOptions) -> T
         outcome = _outcome(episode.frames, options.control_freq)
     return TrialRow(
         trial=episode.index, policy=name, object=trial.object, category=item.category, split=item.split, link=item.link,
-        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, repeat=item.repeat, **outcome,
+        semantic=item.semantic, joint_type=item.joint_type, seed=trial.seed, repeat=item.repeat, mask=mask,
+        **outcome,
     )  # fmt: skip
 
 
@@ -183,6 +191,7 @@ def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
         failure="" if success else _failure(after, len(held) > 0, control_freq),
         seconds=len(after) / control_freq,
         path_length=float(tips.double().diff(dim=0).norm(dim=1).sum()),
+        held_opened=bool(after["held_opened"].any()),
         lost=int((attached[:-1] & ~attached[1:]).sum()),
     )
 

@@ -64,10 +64,14 @@ class TrialRow:
         lost: how often the part was held and then was not; -1 if it was not recorded.
         key: what the trial is (:func:`fb3d_rl.evaluation.trials.trial_key`); "" if it was not recorded.
         policy_digest: what the policy is (:func:`fb3d_rl.policies.digest.policy_digest`); "" if it was not recorded.
+        mask: whether the policy saw which points are the part's, "target" or "none"; "" if it sees no points, or if it
+            was not recorded.
+        held_opened: at some time a part that suction had held was open, by the same rule from its own start: the target
+            or, where suction holds any part, another one.
 
     Raises:
-        ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success
-            or a normalized distance other than 1: a crash counts as a failure.
+        ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success, an
+            opened part or a normalized distance other than 1: a crash counts as a failure.
     """
 
     trial: int
@@ -93,13 +97,16 @@ class TrialRow:
     lost: int = -1
     key: str = ""
     policy_digest: str = ""
+    mask: str = ""
+    held_opened: bool = False
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):
             raise ValueError(f'status is {self.status!r}, not "ok" or "error"')
         if not math.isfinite(self.normalized_distance):
             raise ValueError(f"normalized_distance is {self.normalized_distance}")
-        if self.status == "error" and (self.contact or self.success or self.normalized_distance != 1.0):
+        claims = self.contact or self.success or self.held_opened or self.normalized_distance != 1.0
+        if self.status == "error" and claims:
             raise ValueError("a crashed trial counts as a failure: no contact, no success, distance 1")
 
 

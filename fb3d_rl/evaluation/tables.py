@@ -82,6 +82,8 @@ CONTACT = Metric("contact_rate", "contact", "contact", percent=True, proportion=
 SUCCESS = Metric("success_rate", "success", "success", percent=True, proportion=True)
 MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, proportion=True)
 DISTANCE = Metric("normalized_distance", "normalized distance", "dist.", percent=False, proportion=True)
+HELD = Metric("held_opened_rate", "opened what it held", "held", percent=True, proportion=True)
+"""Of policies that see no part mask: success by whatever part suction held."""
 TRIAL = (CONTACT, SUCCESS, MOTION_ONLY, DISTANCE)
 STEPS = Metric("steps_to_success", "steps to success", "steps", percent=False, proportion=False, decimals=0)
 SECONDS = Metric(
@@ -100,6 +102,7 @@ _VALUES: dict[str, Callable[[Any], float | None]] = {
     "flow/magnitude_error": lambda row: row.magnitude_error,
     "contact_rate": lambda row: float(row.contact),
     "success_rate": lambda row: float(row.success),
+    "held_opened_rate": lambda row: float(row.held_opened) if row.mask == "none" else None,
     "motion_only_success_rate": lambda row: float(row.success) if row.contact else None,
     "normalized_distance": lambda row: row.normalized_distance,
     "steps_to_success": lambda row: float(row.steps) if row.success else None,
@@ -240,7 +243,8 @@ def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | Non
             "n_objects": len({(row.category, row.object) for row in of_policy}),
             "n_error": sum(row.status == "error" for row in of_policy),
         }
-        measured = _measure(of_policy, TRIAL + EFFORT, "", classes) | counts
+        further = (HELD,) if any(row.mask == "none" for row in of_policy) else ()
+        measured = _measure(of_policy, TRIAL + further + EFFORT, "", classes) | counts
         if policy == own:
             out |= measured
         out |= {f"{policy}/{key}": value for key, value in measured.items()}
@@ -265,7 +269,8 @@ def summary(
             the run's own policy, otherwise :func:`own_policy` chooses.
 
     Returns:
-        A flat dict. Each metric m of :data:`FLOW`, :data:`TRIAL` and :data:`EFFORT` has the keys "m" (instance mean),
+        A flat dict. Each metric m of :data:`FLOW`, :data:`TRIAL` and :data:`EFFORT` (and :data:`HELD`, of policies that
+        see no part mask) has the keys "m" (instance mean),
         "m_ci95" ([lo, hi] or None), "m_class_mean" and "m_class_mean_ci95". Trial metrics and the counts "n"
         (scheduled trials), "n_objects" and "n_error" stand there for the run's own policy, and once more as
         "<policy>/..." for every policy. "by_category" (without class means) and, for more than one split,
@@ -334,6 +339,26 @@ def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
     return table
 
 
+def unmasked(numbers: Mapping[str, Any]) -> list[str]:
+    """The policies of a summary that saw no part mask."""
+    return [name for name in policies_of(numbers) if numbers.get(f"{name}/{HELD.key}") is not None]
+
+
+def unmasked_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
+    """What the policies ``names`` opened that saw no part mask, as a rich table with a row for each."""
+    table = Table(
+        title="Without a part mask", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
+    )
+    table.add_column("policy", overflow="fold")
+    for heading in ("opened the target", "95 %", "opened what it held", "95 %"):
+        table.add_column(heading, justify="right")
+    for name in names:
+        keys = [(metric, f"{name}/{metric.key}") for metric in (SUCCESS, HELD)]
+        cells = [(m.show(numbers.get(key)), m.show_interval(numbers.get(f"{key}_ci95"))) for m, key in keys]
+        table.add_row(name, *(cell for pair in cells for cell in pair))
+    return table
+
+
 _POLICIES_PER_TABLE = 2
 
 
@@ -349,6 +374,8 @@ def tables(numbers: Mapping[str, Any]) -> list[Table]:
     if not chunks and not flow:
         return []
     found = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
+    if unmasked(numbers):
+        found.append(unmasked_table(numbers, unmasked(numbers)))
     measured = effort_of(numbers, names)
     return [*found, effort_table(numbers, measured)] if measured else found
 

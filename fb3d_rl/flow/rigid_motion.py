@@ -7,6 +7,9 @@ from torch import Tensor
 
 from fb3d_rl.geometry.transforms import axis_angle_to_matrix, normalize, skew
 
+LOCAL = 0.1
+"""Distance (m) at which a point counts a quarter of one at the place itself in :func:`local_weight`."""
+
 
 def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
     """Velocity v at ``at`` and angular velocity omega of the rigid motion that fits a flow best.
@@ -36,6 +39,18 @@ def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge
     omega = torch.cholesky_solve(momentum[..., None], torch.linalg.cholesky(inertia)).squeeze(-1)
     velocity = mean[:, 3:] - torch.linalg.cross(omega, mean[:, :3])
     return velocity.to(points), omega.to(points)
+
+
+def local_weight(flow: Tensor, squared: Tensor) -> Tensor:
+    """Weights [..., N] for the motion of what moves at a place, where no mask tells one part from another.
+
+    What moves more counts more, and what is near much more than what is farther away than ``LOCAL``.
+
+    Args:
+        flow: [..., N, 3] of each point, 0 where a point does not count.
+        squared: [..., N] squared distance of each point from the place, m^2.
+    """
+    return flow.norm(dim=-1) / (1.0 + squared / LOCAL**2).square()
 
 
 def screw(velocity: Tensor, omega: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:

@@ -32,13 +32,14 @@ class ArtFlowNet(CloudNetwork):
 
     Shapes:
         points [B, N, 3] f32, m, world axes; valid [B, N] bool; part_mask [B, N] bool -> flow [B, N, 3] f32,
-        world axes, trained towards a largest norm of 1 in a cloud; 0 on invalid points.
+        world axes, trained towards a largest norm of 1 in a cloud; 0 on invalid points. A network that was
+        trained without part_mask does not read it.
     """
 
     NAME = "artflownet"
     OUTPUTS = 3
 
-    def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor) -> Tensor:
+    def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Tensor:
         """See the class."""
         return self.per_point(points, valid, part_mask)
 
@@ -99,7 +100,14 @@ class ArtFlowNet(CloudNetwork):
         return super().from_pretrained(PRETRAINED if str(path) == "pretrained" else path)
 
 
+def reads_mask(net: nn.Module) -> bool:
+    """Whether a network was trained with the mask of the part to open; one that does not say so was."""
+    return bool(getattr(net, "part_mask_input", True))
+
+
 def artflownet_module(net: nn.Module) -> TensorDictModule:
-    """Read the observation's points, valid and part_mask; write ("prediction", "flow"), what the network answers."""
-    keys = [("observation", "points"), ("observation", "valid"), ("observation", "part_mask")]
+    """Read the observation's points, valid and, if the network was trained with it, part_mask; write ("prediction",
+    "flow"), what the network answers.
+    """
+    keys = [("observation", key) for key in ("points", "valid", *(["part_mask"] if reads_mask(net) else []))]
     return TensorDictModule(net, in_keys=keys, out_keys=[("prediction", "flow")])

@@ -62,7 +62,7 @@ class CloudNetwork(nn.Module):
     def add_layers(self) -> None:
         """Make what a network has beside its PointNet++: nothing, here."""
 
-    def per_point(self, points: Tensor, valid: Tensor, part_mask: Tensor) -> Tensor:
+    def per_point(self, points: Tensor, valid: Tensor, part_mask: Tensor | None) -> Tensor:
         """Points [B, N, 3] f32 (m, world axes), valid [B, N] bool and part_mask [B, N] bool -> [B, N, OUTPUTS]; 0 on
         invalid points.
         """
@@ -70,7 +70,10 @@ class CloudNetwork(nn.Module):
         # Padding may hold anything, even NaN, which a product with 0 would keep.
         points = points.masked_fill(~valid[..., None], 0.0)
         centre = points.sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1.0)
-        features = part_mask[..., None].to(points.dtype) if self.part_mask_input else None
+        features = None
+        if self.part_mask_input:
+            assert part_mask is not None
+            features = part_mask[..., None].to(points.dtype)
         output: Tensor = self.network(points - centre, valid, features)
         return output
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.flow.rigid_motion import rigid_motion, screw
+from fb3d_rl.flow.rigid_motion import local_weight, rigid_motion, screw
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.transforms import normalize
 
@@ -60,7 +60,7 @@ class ContactOptions:
     turning: float = 1.0
     facing: float = 0.35
     collisions: bool = True
-    hand_radius: float = 0.05
+    hand_radius: float = 0.055
     clearance: float = 0.06
     reach: float = 0.6
     run_up: float = 0.1
@@ -74,7 +74,7 @@ class ContactOptions:
 def choose_contact(
     points: Tensor,
     valid: Tensor,
-    part: Tensor,
+    part: Tensor | None,
     flow: Tensor,
     camera: Tensor,
     hand: Tensor,
@@ -96,8 +96,9 @@ def choose_contact(
     Args:
         points: [B, N, 3] world points, m; the ground is z = 0.
         valid: [B, N] bool.
-        part: [B, N] bool, points of the part to open.
-        flow: [B, N, 3] flow of the part to open, 0 elsewhere.
+        part: [B, N] bool, points of the part to open. Without it the flow says what moves, and each point's way is that
+            of the motion around it, since several parts may move; all else stands in the way.
+        flow: [B, N, 3] flow of the part to open, 0 elsewhere; without ``part`` of whatever moves.
         camera: [B, 3] position of the camera, which tells a surface's outside.
         hand: [B, 3] position of the suction tip, m.
         axis: [B, 3] unit direction from the tip to the hand.
@@ -111,12 +112,14 @@ def choose_contact(
     """
     norm = flow.norm(dim=-1).masked_fill(~valid, 0.0)
     largest = norm.amax(-1, keepdim=True)
-    cloud, seen, obstacle = points, valid, valid & ~part
+    cloud, seen = points, valid
+    obstacle = valid & ~(norm > 0.05 * largest if part is None else part)
     moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen
     if not len(moving):
         nothing = torch.zeros_like(camera)
         return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
-    points, valid, part, flow, avoid, norm = (x[:, moving] for x in (points, valid, part, flow, avoid, norm))
+    points, valid, flow, avoid, norm = (x[:, moving] for x in (points, valid, flow, avoid, norm))
+    body = None if part is None else part[:, moving] & valid
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
     weak = on_part & (norm >= options.weak_flow * largest)
     movable = weak & (norm >= options.min_flow * largest)
@@ -153,7 +156,7 @@ def choose_contact(
     reachable = weak & smooth & fresh & free
     clear = reachable
     if options.collisions:
-        clear = _clear(points, part & valid, flow, cloud, obstacle, standoff, reachable, distance, options)
+        clear = _clear(points, body, flow, cloud, obstacle, standoff, reachable, distance, options)
 
     tiers = [
         movable & smooth & as_usual & fresh & clear,
@@ -235,7 +238,7 @@ def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> T
 
 def _clear(
     points: Tensor,
-    part: Tensor,
+    part: Tensor | None,
     flow: Tensor,
     cloud: Tensor,
     obstacle: Tensor,
@@ -255,15 +258,14 @@ def _clear(
     among = torch.linspace(0, 1, count, device=points.device) * (wanted.sum(-1, keepdim=True) - 1).clamp_min(0)
     index = order.gather(1, among.round().long())  # [B, K]
     contact, away = gather(points, index), gather(standoff, index)
-    centre = (points * part[..., None]).sum(1) / part.sum(-1, keepdim=True).clamp_min(1)
-    velocity, omega = rigid_motion(points, flow, part.to(points.dtype), centre, 1e-4)
-    speed = (velocity[:, None] + torch.linalg.cross(omega[:, None], contact - centre[:, None])).norm(dim=-1)
+    centre, velocity, omega = _motions(points, part, flow, contact)
+    speed = (velocity + torch.linalg.cross(omega, contact - centre)).norm(dim=-1)
     time = options.sweep / speed.clamp_min(1e-6)
-    time = torch.minimum(time, options.sweep_angle / omega.norm(dim=-1, keepdim=True).clamp_min(1e-6))
+    time = torch.minimum(time, options.sweep_angle / omega.norm(dim=-1).clamp_min(1e-6))
     share = torch.linspace(0, 1, options.sweep_steps + 1, device=points.device)[1:]
-    turn, shift = screw(velocity[:, None, None], omega[:, None, None], time[..., None] * share)  # [B, K, steps, 3, 3]
-    arm, away = (contact - centre[:, None])[:, :, None, :, None], away[:, :, None, :, None]
-    at = (turn @ arm).squeeze(-1) + shift + centre[:, None, None]
+    turn, shift = screw(velocity[:, :, None], omega[:, :, None], time[..., None] * share)  # [B, K, steps, 3, 3]
+    arm, away = (contact - centre)[:, :, None, :, None], away[:, :, None, :, None]
+    at = (turn @ arm).squeeze(-1) + shift + centre[:, :, None]
     reach = torch.linspace(options.clearance, HAND_LENGTH, 3, device=points.device)
     hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
     meets = torch.stack(
@@ -275,6 +277,22 @@ def _clear(
     clear = (~meets & (hand[..., 2] > 0)).flatten(2).all(-1)
     result = torch.zeros_like(wanted).scatter(1, index, clear)
     return result & wanted
+
+
+def _motions(points: Tensor, part: Tensor | None, flow: Tensor, contact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, its velocity and the angular velocity [B, 1 or K, 3] with which the points ``contact`` [B, K, 3] move.
+
+    All of them with the part; without a mask each with what moves around it.
+    """
+    if part is not None:
+        centre = (points * part[..., None]).sum(1) / part.sum(-1, keepdim=True).clamp_min(1)
+        velocity, omega = rigid_motion(points, flow, part.to(points.dtype), centre, 1e-4)
+        return centre[:, None], velocity[:, None], omega[:, None]
+    weight = local_weight(flow[:, None], squared_distances(contact, points))
+    count = contact.shape[1]
+    cloud, moves = (x[:, None].expand(-1, count, -1, -1).flatten(0, 1) for x in (points, flow))
+    velocity, omega = rigid_motion(cloud, moves, weight.flatten(0, 1), contact.flatten(0, 1), 1e-4)
+    return contact, velocity.view_as(contact), omega.view_as(contact)
 
 
 def _within(points: Tensor, others: Tensor, radius: float) -> Tensor:

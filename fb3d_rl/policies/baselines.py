@@ -64,6 +64,7 @@ def normal_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = No
     flow policy does, so that it needs nothing privileged.
     """
     options = options or FlowPolicyOptions()
+    options.require_mask("policy=normal")
     return TensorDictSequential(
         NormalFlow(options.contact.neighbors), FlowPolicy(("prediction", "flow"), limits, options)
     )

@@ -53,4 +53,6 @@ def direction_policy(
 ) -> TensorDictSequential:
     """The flow policy fed with the direction that a DirectionNet scores best."""
     assert isinstance(net, DirectionNet)
+    if options is not None:
+        options.require_mask("policy=ump_di")
     return TensorDictSequential(DirectionFlow(net), FlowPolicy(("prediction", "flow"), limits, options))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
@@ -17,10 +18,11 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.flow.rigid_motion import rigid_motion
+from fb3d_rl.contract import UserError
+from fb3d_rl.flow.rigid_motion import local_weight, rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
-from fb3d_rl.models.artflownet import artflownet_module
+from fb3d_rl.models.artflownet import artflownet_module, reads_mask
 from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
@@ -29,6 +31,9 @@ SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
 
 PHASES = ("select", "travel", "approach", "pull", "retreat", "release")
 """Their names."""
+
+MASK = ("observation", "part_mask")
+"""Where the mask of the part to open is read."""
 
 TRIES = 6
 """Contact points that are remembered as tried in vain."""
@@ -64,6 +69,9 @@ class FlowPolicyOptions:
         funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
         free: distance (m) from the visible points at which a straight way to the approach line is free.
         margin: distance (m) that the tip keeps from the object's bounding sphere where the straight way is not free.
+        mask: which points the policy is told to act on: "target", those of the part to open, or "none": whatever has a
+            flow (the paper's "without mask").
+        contact: how a contact point is chosen.
     """
 
     travel_speed: float = 1.8
@@ -84,11 +92,21 @@ class FlowPolicyOptions:
     retry_distance: float = 0.08
     nearby: float = 0.1
     lead: float = 0.5
-    clearance: float = 0.08
+    clearance: float = 0.07
     funnel: float = 0.5
     free: float = 0.08
     margin: float = 0.1
+    mask: Literal["target", "none"] = "target"
     contact: ContactOptions = field(default_factory=ContactOptions)
+
+    def require_mask(self, what: str) -> None:
+        """Check that the policy is shown the part to open.
+
+        Raises:
+            UserError: it is not, and ``what`` cannot do without.
+        """
+        if self.mask != "target":
+            raise UserError(f"{what} has to see which part to open: leave policy.mask=target")
 
 
 @dataclass
@@ -171,8 +189,9 @@ class FlowPolicy(TensorDictModuleBase):
         )
         self._still = o.stuck_speed * self._period
         self._fade = o.fade ** (self._period / 0.05)
-        observed = ("points", "valid", "part_mask", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
+        observed = ("points", "valid", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
         self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
+        self.in_keys += [MASK] if o.mask == "target" else []
         self.in_keys += [("policy", key) for key in self.STATE]
         self.out_keys = ["action"] + [("next", "policy", key) for key in self.STATE]
 
@@ -320,11 +339,11 @@ class FlowPolicy(TensorDictModuleBase):
         if not rows:
             return
         tip = obs["tool_pose"][..., :3]
-        points, valid, part, camera, hand, axis, flow = (
-            _rows(x, rows)
-            for x in (obs["points"], obs["valid"], obs["part_mask"], obs["camera_position"], tip, axis, flow)
+        points, valid, camera, hand, axis, flow = (
+            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["camera_position"], tip, axis, flow)
         )
-        flow = torch.where((part & valid)[..., None], flow, 0.0)
+        part = self._part(obs, rows)
+        flow = torch.where((valid if part is None else part & valid)[..., None], flow, 0.0)
         avoid = torch.zeros_like(valid)
         for k, i in enumerate(rows):
             for tried in torch.from_numpy(memories[i].tried[: memories[i].tries]).to(points):
@@ -335,6 +354,10 @@ class FlowPolicy(TensorDictModuleBase):
             memory.contact_point, memory.pull, memory.standoff, memory.candidates = found
             if memory.pull.any():
                 memory.phase, memory.chosen = TRAVEL, memory.chosen + 1
+
+    def _part(self, obs: TensorDictBase, rows: list[int]) -> Tensor | None:
+        """The mask of the part to open [K, N], if the policy is shown it."""
+        return None if self.options.mask == "none" else _rows(obs["part_mask"], rows)
 
     def _path_velocity(self, memory: Memory, tip: Vector) -> Vector:
         """Tip velocity (m/s) of the phases APPROACH, RETREAT and RELEASE; 0 while no contact point can be chosen."""
@@ -420,18 +443,21 @@ class FlowPolicy(TensorDictModuleBase):
         """Unit flow at the held point of each environment that pulls, ``lead`` ahead; the last one where none is seen.
 
         The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the
-        near ones foremost: the hand often hides those around the held point.
+        near ones foremost: the hand often hides those around the held point. Without a mask what has a flow may belong
+        to several parts, so that only what is near counts.
         """
         rows = _in_phase(memories, PULL)
         if not rows:
             return {}
         o = self.options
-        points, valid, part, tool_pose, flow = (
-            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["part_mask"], obs["tool_pose"], flow)
-        )
+        points, valid, tool_pose, flow = (_rows(x, rows) for x in (obs["points"], obs["valid"], obs["tool_pose"], flow))
+        part = self._part(obs, rows)
         tip = tool_pose[:, :3]
         squared = squared_distances(points, tip[:, None]).squeeze(-1)
-        weight = (part & valid) / (1.0 + squared / o.nearby**2)
+        if part is None:
+            weight = local_weight(flow, squared).masked_fill(~valid, 0.0)
+        else:
+            weight = (part & valid) / (1.0 + squared / o.nearby**2)
         motion = rigid_motion(points, flow, weight, tip, 1e-2 * o.nearby**2)
         found = {}
         for i, at_tip, omega in zip(rows, *map(_numbers, motion), strict=True):
@@ -500,5 +526,11 @@ def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = No
 def artflownet_policy(
     net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
 ) -> TensorDictModule:
-    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form."""
+    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form.
+
+    Raises:
+        UserError: the network reads the mask that the options keep from the policy.
+    """
+    if options is not None and reads_mask(net):
+        options.require_mask("a network that was trained with the mask")
     return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))

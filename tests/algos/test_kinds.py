@@ -174,11 +174,14 @@ def test_a_run_in_small_is_resumed_and_evaluated_bit_for_bit(name: str, tmp_path
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", ["no_mask", "no_mask_vpa", "any_mask"])
 def test_the_paper_s_variants_of_artflownet_are_evaluated(variant: str, tmp_path: Path, config: Config) -> None:
-    words = [f"algo=artflownet_{variant}", *SMALL, *TRAINING, "evaluation.trials=0"]
-    run(config("train", words), tmp_path)
+    words = [f"algo=artflownet_{variant}", *SMALL, *TRAINING]
+    mask = "target" if variant == "any_mask" else "none"
+    assert [row.mask for row in run(config("train", words), tmp_path)] == [mask]
     net = load_trained(tmp_path / "checkpoint.pt", "artflownet")
     assert net.part_mask_input == (variant == "any_mask")
     given = ["policy=artflownet", f"checkpoint={tmp_path / 'checkpoint.pt'}"]
     rows = run_evaluation(config("evaluate", [*SMALL, *given]), tmp_path / "evaluated")
     assert [(row.policy, row.status) for row in rows] == [("artflownet", "ok")]
+    assert [row.mask for row in rows] == [mask]
+    assert ("held_opened_rate" in json.loads((tmp_path / "evaluated" / "summary.json").read_text())) == (mask == "none")
     assert (tmp_path / "evaluated" / "flow_rows_all_parts.csv").is_file()

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from fb3d_rl.algos.setup import eval_entries, one_object, train_entries
+from fb3d_rl.algos.artflownet import run_evaluation
+from fb3d_rl.algos.setup import env_options, eval_entries, flow_policy_options, one_object, settled, train_entries
 from fb3d_rl.assets.partnet_mobility import read_category
 from fb3d_rl.config import AssetsConfig
 from fb3d_rl.contract import UserError
@@ -119,3 +120,40 @@ def test_an_object_that_is_not_there_is_named(
     with pytest.raises(UserError) as error:
         one_object(config("view", [word.replace("ROOT", str(procedural_root)) for word in overrides]), tmp_path)
     assert all(word in str(error.value) for word in words), error.value
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "trained_with_mask", "expected"),
+    [
+        ("train", [], None, ("target", "target")),
+        ("train", ["algo=artflownet_no_mask"], None, ("none", "any")),
+        ("train", ["algo=artflownet_no_mask_vpa"], None, ("none", "any")),
+        ("train", ["algo=artflownet_no_mask", "policy.mask=target"], None, ("target", "target")),
+        ("train", ["algo=dagger"], None, ("target", "target")),
+        ("train", ["algo=artflownet_no_mask", "env.suction.hold=target"], None, ("none", "target")),
+        ("evaluate", [], None, ("target", "target")),
+        ("evaluate", ["policy.mask=none"], None, ("none", "any")),
+        ("evaluate", [], False, ("none", "any")),
+        ("evaluate", ["policy.mask=target"], False, ("target", "target")),
+        ("evaluate", ["env.suction.hold=any"], True, ("target", "any")),
+        ("view", [], False, ("none", "any")),
+    ],
+)
+def test_the_mask_follows_from_the_network_unless_it_is_named(
+    name: str,
+    words: list[str],
+    trained_with_mask: bool | None,
+    expected: tuple[str, str],
+    config: Callable[[str, list[str]], Any],
+) -> None:
+    cfg = settled(config(name, words), trained_with_mask)
+    assert (flow_policy_options(cfg).mask, env_options(cfg).suction.hold) == expected
+    assert settled(cfg) == cfg, "what is settled stays so"
+
+
+def test_a_network_that_reads_the_mask_is_not_evaluated_without(
+    tmp_path: Path, config: Callable[[str, list[str]], Any]
+) -> None:
+    cfg = config("evaluate", ["policy=artflownet", "checkpoint=pretrained", "policy.mask=none", "assets.eval_count=1"])
+    with pytest.raises(UserError, match=r"trained with the mask.*policy\.mask=target"):
+        run_evaluation(cfg, tmp_path)

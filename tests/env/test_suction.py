@@ -63,6 +63,37 @@ def test_other_movable_parts_are_held_only_if_asked(objects: dict[str, Articulat
     assert not bool(info["contact"]), "another part is not the one to open"
 
 
+def test_another_part_that_was_held_and_opened_is_told_from_the_target(objects: dict[str, ArticulatedObject]) -> None:
+    obj = objects["Table"]
+    target, other = links_called(obj, "drawer")[:2]
+    env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(hold="any")))
+    place_before(env, other, start(env, obj, target))
+    step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached, limit=20)
+    assert not bool(env.evaluate()["held_opened"]), "it is not open yet"
+    opened, (*_, terminated, _, info) = step_until(
+        env, velocity(x=-0.4), lambda: bool(env.evaluate()["held_opened"]), limit=60
+    )
+    assert opened and not bool(terminated) and not bool(info["success"]) and not bool(info["contact"])
+    assert float(info["normalized_distance"]) == pytest.approx(1.0, abs=1e-3)
+    state = env.get_state()
+    env.stages[0].suction.release()
+    assert bool(env.step(velocity())[-1]["held_opened"]), "it was held before"
+    start(env, obj, target)
+    assert not bool(env.evaluate()["held_opened"]), "another episode"
+    env.set_state(state)
+    assert bool(env.evaluate()["held_opened"]), "a restored state knows what was held"
+
+
+def test_the_target_s_opening_is_that_of_what_is_held_even_by_a_part_on_it(
+    env: OpenArticulatedEnv, objects: dict[str, ArticulatedObject]
+) -> None:
+    drawer = links_called(objects["Table"], "drawer")[0]
+    place_before(env, drawer, start(env, objects["Table"], drawer))
+    step_until(env, velocity(x=0.3), lambda: env.stages[0].suction.attached)
+    opened, (*_, info) = step_until(env, velocity(x=-0.4), lambda: bool(env.evaluate()["success"]))
+    assert opened and bool(info["held_opened"])
+
+
 def test_the_static_body_is_never_held(objects: dict[str, ArticulatedObject]) -> None:
     obj = objects["StorageFurniture"]
     env = OpenArticulatedEnv([obj], EnvOptions(points=POINTS, suction=SuctionOptions(hold="any")))

@@ -6,6 +6,7 @@ import json
 import re
 import runpy
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -78,6 +79,18 @@ def fill(run: Path) -> list[TrialRow]:
         title=np.array(["first", EVIL, "nothing visible"]),
     )
     return rows
+
+
+def test_a_policy_without_a_mask_shows_what_it_opened_of_what_it_held(tmp_path: Path) -> None:
+    rows = fill(tmp_path / "masked")
+    run = tmp_path / "run"
+    run.mkdir()
+    blind = [replace(row, mask="none", held_opened=row.trial > 3) for row in rows if row.policy == "artflownet"]
+    for folder, content in ((tmp_path / "masked", rows), (run, blind)):
+        write_trials(folder / "rows.csv", content)
+        (folder / "summary.json").write_text(json.dumps(summary(content, [])))
+        text = write_report(folder, tmp_path / "page.html").read_text()
+        assert ("Opened what it held" in text) == (folder == run)
 
 
 class Page(HTMLParser):

@@ -29,7 +29,7 @@ from fb3d_rl.evaluation.rollout import _outcome, limits_of, run_trials
 from fb3d_rl.evaluation.trials import Scheduled, schedule
 from fb3d_rl.flow.opening import openable_links
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 
 CAMERA = CameraOptions(resolution=48)
 OPTIONS = EnvOptions(points=300, camera=CAMERA, horizon=150)
@@ -98,6 +98,51 @@ def test_the_expert_opens_at_other_control_frequencies(
     rows = run_trials("expert", expert_policy(limits_of(options)), objects, trials[::2], options)
     assert all(row.success for row in rows)
     assert all(row.seconds < 7.0 for row in rows)
+
+
+def test_without_a_mask_the_expert_still_opens_and_rows_say_what_was_held(
+    objects: list[ArticulatedObject], trials: list[Scheduled]
+) -> None:
+    options = replace(OPTIONS, suction=replace(OPTIONS.suction, hold="any"))
+    maskless = expert_policy(LIMITS, FlowPolicyOptions(mask="none"))
+    rows = run_trials("expert", maskless, objects, trials, options)
+    assert all(row.success and row.held_opened and row.mask == "none" for row in rows)
+    rows = run_trials("expert", expert_policy(LIMITS), objects, trials[:1], OPTIONS)
+    assert [(row.mask, row.held_opened) for row in rows] == [("target", rows[0].success)]
+
+
+class Astray(TensorDictModuleBase):
+    """The expert without a mask, whose flow is that of another part: the one the camera sees most of."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.expert = expert_policy(LIMITS, FlowPolicyOptions(mask="none"))
+        self.in_keys, self.out_keys = [*self.expert.in_keys, ("privileged", "link")], self.expert.out_keys
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        link, true = td["privileged", "link"], td["privileged", "flow"]
+        other = int(link[(link >= 0) & (true.norm(dim=-1) == 0) & self.drawer(td)].mode().values)
+        along = true[true.norm(dim=-1) > 0][0]
+        td["privileged", "flow"] = torch.where((link == other)[..., None], along, torch.zeros(3))
+        return self.expert(td)
+
+    def drawer(self, td: TensorDictBase) -> torch.Tensor:
+        return torch.isin(td["privileged", "link"], self.drawers)
+
+    drawers: torch.Tensor
+
+
+def test_opening_another_part_is_no_success_but_what_was_held_was_opened(tmp_path: Path) -> None:
+    """A cabinet with several drawers: the policy is led to another one than the target."""
+    obj = load_object(tmp_path / procedural.generate(tmp_path, ["Table"], 1, 0)[0])
+    drawers = [i for i in openable_links(obj) if obj.links[i].semantic == "drawer"]
+    scheduled = [item for item in schedule([(obj, "")], SampleOptions(points=300, camera=CAMERA), seed=0)[0]
+                 if item.trial.link == drawers[0]]  # fmt: skip
+    policy = Astray()
+    policy.drawers = torch.tensor(drawers[1:])
+    options = replace(OPTIONS, suction=replace(OPTIONS.suction, hold="any"))
+    (row,) = run_trials("astray", policy, [obj], scheduled, options)
+    assert (row.status, row.success, row.contact, row.held_opened) == ("ok", False, False, True)
 
 
 def test_a_policy_that_stands_still_opens_nothing(objects: list[ArticulatedObject], trials: list[Scheduled]) -> None:
@@ -243,6 +288,7 @@ def frames(distance: list[float], contact: list[bool], attached: list[bool], for
         "success": column([d < 0.1 for d in distance]),
         "normalized_distance": column(distance),
         "contact": column(contact),
+        "held_opened": column([False] * steps),
         "observation": seen,
     }
     return TensorDict({"observation": {"tool_pose": pose[:-1]}, "next": after}, batch_size=[steps])

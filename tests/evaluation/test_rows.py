@@ -49,7 +49,9 @@ def test_an_empty_table_still_has_its_header(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "claim", [{"contact": True}, {"success": True}, {"normalized_distance": 0.0}], ids=lambda c: next(iter(c))
+    "claim",
+    [{"contact": True}, {"success": True}, {"held_opened": True}, {"normalized_distance": 0.0}],
+    ids=lambda c: next(iter(c)),
 )
 def test_a_crashed_trial_cannot_claim_anything(claim: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="crashed"):

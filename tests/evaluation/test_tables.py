@@ -202,6 +202,22 @@ def test_the_terminals_table_has_every_category_and_fits() -> None:
     assert not any("…" in line for line in lines)
 
 
+def test_what_was_opened_without_a_mask_is_counted_beside_success() -> None:
+    seen = [trial("Oven", name, name == "a", policy="masked", mask="target", held_opened=name == "a") for name in "ab"]
+    blind = [trial("Oven", name, name == "a", mask="none", held_opened=name != "d") for name in "abcd"]
+    numbers = summary([*seen, *blind], [])
+    assert numbers["artflownet/success_rate"] == 0.25 and numbers["artflownet/held_opened_rate"] == 0.75
+    assert numbers["by_category"]["Oven"]["artflownet/held_opened_rate"] == 0.75
+    assert not any(key.startswith("masked/held") for key in numbers)
+    out = io.StringIO()
+    show(numbers, Console(file=out, width=100))
+    line = next(line for line in out.getvalue().split("Without a part mask")[1].splitlines() if "artflownet" in line)
+    assert "25 %" in line and "75 %" in line
+    out = io.StringIO()
+    show(summary(seen, []), Console(file=out, width=100))
+    assert "mask" not in out.getvalue().replace("masked", "")
+
+
 def test_a_table_of_benchmarks_has_every_number() -> None:
     rows = list(number_rows({"steps": {"a": 1234.5, "b": 0.5123, "objects": ["x"], "c": "not measured"}}))
     assert rows == [("steps", "a", "1234"), ("steps", "b", "0.512"), ("steps", "c", "not measured")]

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.perception.contact import CANDIDATES, ContactOptions, best_candidate, choose_contact
+from fb3d_rl.perception.contact import CANDIDATES, ContactOptions, _motions, best_candidate, choose_contact
 
 TOWARDS = torch.tensor([[-1.0, 0.0, 0.0]])
 """Axis of a hand that stands before the plate."""
@@ -207,3 +207,37 @@ def test_a_hand_that_would_come_from_below_the_ground_takes_another_way() -> Non
         lift = torch.tensor([0.0, 0.0, height])
         _, direction, standoff = choose(points * torch.tensor([1.0, 1.0, 0.0]) + lift, flow)
         assert torch.allclose(direction, standoff, atol=1e-5) == fits
+
+
+def doors() -> tuple[torch.Tensor, torch.Tensor]:
+    """Two plates side by side [1, N, 3] with flows away from each other's hinges, the right one's a little larger."""
+    left = plate()
+    right = left + torch.tensor([0.0, 1.2, 0.0])
+    outward = torch.zeros_like(right)
+    outward[..., 0] = -(right[..., 1] - 0.7) * 1.1
+    return torch.cat([left, right], 1), torch.cat([hinge_flow(left), outward], 1)
+
+
+def test_without_a_mask_each_point_moves_with_what_is_around_it() -> None:
+    points, flow = doors()
+    contact = points[:, [5 * 25 + 12, 625 + 15 * 25 + 12]]
+    true = flow[:, [5 * 25 + 12, 625 + 15 * 25 + 12]]
+    centre, velocity, omega = _motions(points, None, flow, contact)
+    assert torch.equal(centre, contact)
+    torch.testing.assert_close(velocity, true, atol=0.03, rtol=0)
+    assert omega[0, 0, 2] < -0.5 and omega[0, 1, 2] > 0.5, "one turns clockwise, the other one counter-clockwise"
+    together = _motions(points, flow.norm(dim=-1) > 0, flow, contact)
+    assert together[0].shape == (1, 1, 3)
+
+
+def test_without_a_mask_what_moves_is_chosen_and_what_does_not_is_in_the_way() -> None:
+    points = plate()
+    shelf = points[points[..., 1] < 0.1].clone() - torch.tensor([0.2, 0.0, 0.0])  # a board in front of the outer part
+    cloud = torch.cat([points, shelf[None]], dim=1)
+    flow = torch.cat([hinge_flow(points), torch.full((1, len(shelf), 3), 1e-3)], dim=1)
+    valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
+    camera = torch.tensor([[-3.0, 0.0, 1.0]])
+    contact, *_ = choose_contact(
+        cloud, valid, None, flow, camera, camera, TOWARDS, ~valid, ContactOptions(min_flow=0.1)
+    )
+    assert contact[0, 1] > 0.1 and contact[0, 0] == 0.0

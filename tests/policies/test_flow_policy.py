@@ -415,3 +415,30 @@ def test_without_retries_a_stuck_hand_pulls_on_and_a_failed_touch_is_the_last() 
     for _ in range(10):
         pressing["policy"] = policy(pressing)["next", "policy"]
     assert int(pressing["policy", "phase"]) == SELECT
+
+
+def test_without_a_mask_a_neighbour_s_flow_does_not_turn_the_pull() -> None:
+    """Two drawers' flows at once: one goes out, the other one, half a metre away, to the side."""
+    door = ToyDoor(sliding=True)
+    td = door.observe(FlowPolicy.initial_state((1,)))
+    points, flow = td["observation", "points"], td["privileged", "flow"].clone()
+    flow[points[..., 1] > 0.2] = torch.tensor([0.0, 0.0, 1.0])
+    td["privileged", "flow"] = flow
+    td["policy", "phase"] = torch.full((1, 1), PULL)
+    td["observation", "tool_pose"][:, :3], td["observation", "attached"] = (
+        torch.tensor([0.0, -0.3, 0.7]),
+        torch.ones(1, 1).bool(),
+    )
+    del td["observation", "part_mask"]
+    policy = expert_policy(LIMITS, FlowPolicyOptions(lead=0.0, mask="none"))
+    pull = policy(td)["next", "policy", "pull"][0]
+    assert float(pull @ torch.tensor([-1.0, 0.0, 0.0])) > 0.99
+
+
+def test_without_a_mask_the_largest_flow_of_the_whole_cloud_counts() -> None:
+    policy = expert_policy(LIMITS, FlowPolicyOptions(mask="none"))
+    td = ToyDoor().observe(policy.initial_state((1,)))
+    with_mask = expert_policy(LIMITS)(td.clone())["next", "policy", "contact_point"]
+    td["observation", "part_mask"] = torch.zeros_like(td["observation", "part_mask"])
+    assert torch.equal(policy(td.clone())["next", "policy", "contact_point"], with_mask)
+    assert int(expert_policy(LIMITS)(td)["next", "policy", "phase"]) == SELECT, "the mask hides all of it"

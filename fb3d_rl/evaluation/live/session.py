@@ -231,7 +231,7 @@ class Session:
         if self.trial is not None and (self.trial.attached or self.trial.done):
             raise UserError("the hand is past the choice of a contact point; press reset to choose another")
         obs, flow = self._frame["observation"], self._frame[FLOWS[self.flow]]
-        on_part = (obs["valid"] & obs["part_mask"])[0].nonzero().flatten()
+        on_part = self._shown()[0].nonzero().flatten()
         if not len(on_part):
             raise UserError("the camera sees nothing of the part; turn it until it does")
         way = obs["points"][0, on_part].double() - torch.as_tensor(origin)
@@ -311,20 +311,25 @@ class Session:
             return None
         return Contact(point[0].numpy(), pull[0].numpy(), standoff[0].numpy()) if bool(pull.any()) else None
 
+    def _shown(self) -> Tensor:
+        """The points [1, N] that the policy may touch: those of the part, or all if it is not told which they are."""
+        obs = self._frame["observation"]
+        return obs["valid"] if self._policy_options.mask == "none" else obs["valid"] & obs["part_mask"]
+
     def _choose(self, avoid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
         obs, options = self._frame["observation"], self._policy_options.contact
-        part = obs["part_mask"] & obs["valid"]
-        flow = torch.where(part[..., None], self._frame[FLOWS[self.flow]], 0.0)
+        shown = self._shown()
+        flow = torch.where(shown[..., None], self._frame[FLOWS[self.flow]], 0.0)
         if avoid is None:
-            avoid = torch.zeros_like(part)
+            avoid = torch.zeros_like(shown)
         else:  # a person may want a point that the heuristic does not consider
             options = replace(options, min_flow=0.0, weak_flow=0.0)
         pose = obs["tool_pose"]
         return choose_contact(
             obs["points"],
             obs["valid"],
-            part,
+            None if self._policy_options.mask == "none" else shown,
             flow,
             obs["camera_position"],
             pose[:, :3],
