@@ -7,6 +7,7 @@ N is the number of points of a cloud (1200 unless configured otherwise).
 
 from __future__ import annotations
 
+import errno
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,10 @@ class UserError(Exception):
     """
 
 
+class Interrupted(UserError):
+    """Ctrl-C ended the work; the message says what is kept."""
+
+
 def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
     """Run a command and turn what the user can mend into one sentence on stderr.
 
@@ -40,13 +45,21 @@ def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
     except UserError as error:
         sentence = str(error)
     except OSError as error:
-        if error.filename is None:
+        if (found := of_disk(error)) is None:
             raise
-        sentence = f"{error.filename} cannot be written or read ({error.strerror})"
+        sentence = found
     except KeyboardInterrupt:
         sentence = f"interrupted; {interrupted}"
     print(f"error: {sentence}", file=sys.stderr)
     return 2
+
+
+def of_disk(error: OSError) -> str | None:
+    """What the disk or a file is at fault of; None if it is not."""
+    if error.filename is not None:
+        return f"{error.filename} cannot be written or read ({error.strerror})"
+    full = (errno.ENOSPC, getattr(errno, "EDQUOT", None))
+    return f"the disk has no room ({error.strerror})" if error.errno in full else None
 
 
 Key = str | tuple[str, ...]

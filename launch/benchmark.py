@@ -7,6 +7,11 @@ python launch/benchmark.py network --peer DIR     ArtFlowNet's training against 
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import argparse
 import json
 import os
@@ -108,4 +113,4 @@ def run(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupt.run(main)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,11 +19,12 @@ import run_folder
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
-from fb3d_rl.contract import UserError
+from fb3d_rl.contract import Interrupted, UserError, of_disk
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig | ViewConfig]] = {
@@ -39,17 +41,41 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
 
     With ``keeps=False`` nothing is kept of a run: hydra.run.dir is no folder of its own, and nothing is written there.
 
-    Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend.
+    Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend. A job of a sweep (-m) that fails
+    leaves the others alone: it is named when it does and in the end, and the exit code is 2.
     """
     schemas = {**SCHEMAS, **{f"algo/{kind}": node for kind, node in ALGOS.items()}}
+    process = os.getpid()
+    failed: dict[str, str] = {}  # what is wrong with jobs of a sweep
+    jobs: list[str] = []  # all of them
     ConfigStore.instance().store(name=f"{name}_schema", node=SCHEMAS[name])
     for kind, node in ALGOS.items():
         ConfigStore.instance().store(group="algo", name=f"{kind}_schema", node=node)
 
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:
+        hydra_config = HydraConfig.get()
+        if hydra_config.mode != RunMode.MULTIRUN:
+            one(raw)
+            return
+        common = {word.lower() for word in sys.argv}
+        swept = [word for word in hydra_config.overrides.task if word.lower() not in common]
+        jobs.append(f"job {hydra_config.job.num} ({' '.join(swept)})")
+        try:
+            one(raw, f"{jobs[-1]}: ")
+        except _Failed as failure:
+            if os.getpid() != process:  # a launcher of other processes hands on what is raised
+                raise UserError(failure.sentence) from None
+            failed[jobs[-1]] = failure.sentence
+        except Exception as error:  # noqa: BLE001, a fault of the program, which is not one of the other jobs'
+            if os.getpid() != process:
+                raise
+            traceback.print_exc()
+            failed[jobs[-1]] = f"{type(error).__name__}: {error}"
+
+    def one(raw: DictConfig, where: str = "") -> None:
         out = Path(HydraConfig.get().runtime.output_dir)
-        with _one_sentence():
+        with _one_sentence(where):
             if not keeps:
                 cfg: Any = OmegaConf.to_object(raw)
                 validate(cfg)
@@ -69,29 +95,45 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
 
     with _one_sentence():
         job()
+    if failed:
+        print(f"error: {len(failed)} of {len(jobs)} jobs failed:", file=sys.stderr)
+        for name, sentence in failed.items():
+            print(f"  {name}: {sentence}", file=sys.stderr)
+        sys.exit(2)
+
+
+class _Failed(SystemExit):
+    """Ends the process, or this job of a sweep, once it has been said what is wrong."""
+
+    def __init__(self, sentence: str) -> None:
+        super().__init__(2)
+        self.sentence = sentence
 
 
 @contextmanager
-def _one_sentence() -> Iterator[None]:
+def _one_sentence(where: str = "") -> Iterator[None]:
     """Turn an error that the user can mend into one sentence; inside the job, before Hydra adds words of its own."""
+
+    def say(sentence: str) -> _Failed:
+        sentence = " ".join(sentence.split())
+        print(f"error: {where}{sentence}", file=sys.stderr)
+        return _Failed(sentence)
+
     try:
         yield
+    except Interrupted as error:
+        sys.exit(say(str(error)).code)  # the whole sweep
     except UserError as error:
-        fail(str(error))
+        raise say(str(error)) from error
     except (HydraException, OmegaConfBaseException) as error:
-        fail(_sentence(error))
+        raise say(_sentence(error)) from error
     except OSError as error:
-        if error.filename is None:
+        if (sentence := of_disk(error)) is None:
             raise
-        fail(f"{error.filename} cannot be written or read ({error.strerror}); choose another folder: hydra.run.dir=DIR")
+        raise say(f"{sentence}; choose another folder: hydra.run.dir=DIR") from error
     except KeyboardInterrupt:
-        fail("interrupted; a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER")
-
-
-def fail(sentence: str) -> None:
-    """Say what is wrong on stderr and end with exit code 2."""
-    print(f"error: {' '.join(sentence.split())}", file=sys.stderr)
-    sys.exit(2)
+        hint = "a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER"
+        sys.exit(say(f"interrupted; {hint}").code)
 
 
 def _sentence(error: BaseException) -> str:

@@ -10,6 +10,11 @@ python launch/demos.py import FILE.h5|FOLDER OUT      the same, or RecordEpisode
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import argparse
 import os
 import sys
@@ -287,4 +292,4 @@ def _print(table: Table) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupt.run(main)

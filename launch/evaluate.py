@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 from pathlib import Path
 from typing import Any
 
@@ -16,4 +21,4 @@ def task(cfg: Any, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main("evaluate", task)
+    interrupt.run(lambda: main("evaluate", task))

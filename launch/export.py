@@ -6,9 +6,13 @@ python launch/export.py RUN/checkpoint.pt flow.pt2             a program of torc
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -51,4 +55,4 @@ def run(options: argparse.Namespace) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupt.run(main)

@@ -9,10 +9,14 @@ python launch/objects.py preview DIR --out FILE.png|html [--split SPLIT] [--each
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -151,15 +155,13 @@ def preview(options: argparse.Namespace) -> None:
 
 def validate(options: argparse.Namespace) -> int:
     """List flaws."""
-    from concurrent.futures import ProcessPoolExecutor
-    from multiprocessing import get_context
-
     from rich import box
     from rich.console import Console
     from rich.progress import track
     from rich.table import Table
 
     from fb3d_rl.assets.folders import find_folders
+    from fb3d_rl.children import withheld, worker_pool
     from fb3d_rl.contract import UserError
     from fb3d_rl.files import write_text
     from fb3d_rl.flow.validation import examine
@@ -167,9 +169,10 @@ def validate(options: argparse.Namespace) -> int:
     if options.workers < 1:
         raise UserError(f"--workers {options.workers} is too small; give 1 or more")
     folders = list(find_folders(options.dir).values())
-    # Spawned: a forked process would inherit torch's threads in the middle of what they do.
-    with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
-        verdicts = list(track(pool.map(examine, folders), "objects", len(folders)))
+    with worker_pool(options.workers) as pool:
+        with withheld():
+            examined = pool.map(examine, folders)
+        verdicts = list(track(examined, "objects", len(folders)))
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("object", "category", "parts that open", "what is wrong"):
         table.add_column(name, overflow="fold")
@@ -194,4 +197,4 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
 }
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupt.run(main)

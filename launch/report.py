@@ -8,9 +8,13 @@ python launch/report.py --paper RUN      sets an evaluation on PartNet-Mobility 
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,36 +43,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
+    from fb3d_rl.contract import exit_code
+
+    return exit_code(lambda: run(options), interrupted="nothing was written")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Read the runs, print and write."""
     from fb3d_rl.contract import UserError
     from fb3d_rl.evaluation import comparison, comparison_page, published, report, runs, tables
     from fb3d_rl.files import write_text
 
     folders: list[Path] = options.runs
-    try:
-        if options.paper:
-            if len(folders) != 1:
-                raise UserError("--paper sets one run beside what is published; give one run folder")
-            page = published.paper(runs.read_run(folders[0]), options.variant)
-            path = options.out or folders[0] / "paper.md"
-            write_text(path, page)
-        elif len(folders) == 1 and runs.is_run(folders[0]):
-            path = report.write_report(folders[0], options.out)
-            tables.show(runs.read_run(folders[0]).summary)
-        else:
-            finished, unfinished = runs.find_runs(folders)
-            found = comparison.compare([runs.read_run(run) for run in finished])
-            resolved = [folder.resolve() for folder in folders]
-            beside = resolved[0] if len(folders) == 1 else Path(os.path.commonpath([run.parent for run in resolved]))
-            path = comparison_page.write_comparison(found, options.out or beside / "comparison.html", unfinished)
-            comparison.show(found)
-            if unfinished:
-                print(f"left out, not finished (no summary.json): {', '.join(map(str, unfinished))}")
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    if options.paper:
+        if len(folders) != 1:
+            raise UserError("--paper sets one run beside what is published; give one run folder")
+        page = published.paper(runs.read_run(folders[0]), options.variant)
+        path = options.out or folders[0] / "paper.md"
+        write_text(path, page)
+    elif len(folders) == 1 and runs.is_run(folders[0]):
+        path = report.write_report(folders[0], options.out)
+        tables.show(runs.read_run(folders[0]).summary)
+    else:
+        finished, unfinished = runs.find_runs(folders)
+        found = comparison.compare([runs.read_run(run) for run in finished])
+        resolved = [folder.resolve() for folder in folders]
+        beside = resolved[0] if len(folders) == 1 else Path(os.path.commonpath([run.parent for run in resolved]))
+        path = comparison_page.write_comparison(found, options.out or beside / "comparison.html", unfinished)
+        comparison.show(found)
+        if unfinished:
+            print(f"left out, not finished (no summary.json): {', '.join(map(str, unfinished))}")
     print(f"wrote {path}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupt.run(main)

@@ -5,6 +5,11 @@ ArtFlowNet by several processes or GPUs: ``torchrun --nproc-per-node=N launch/tr
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 from pathlib import Path
 from typing import Any
 
@@ -24,4 +29,4 @@ def task(cfg: Any, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main("train", task)
+    interrupt.run(lambda: main("train", task))

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from fb3d_rl import interrupt
+
+if __name__ == "__main__":
+    interrupt.expect()
+
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -36,4 +41,4 @@ def task(cfg: Any, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main("view", task, keeps=False)
+    interrupt.run(lambda: main("view", task, keeps=False))

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import content_of, load_object
+from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
@@ -88,17 +85,13 @@ def generate_samples(
             drawn += len(job[3])
             progress(drawn)
     else:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet) as pool:
-            with _no_interrupt():
+        with worker_pool(workers, _quiet) as pool:
+            with withheld():
                 futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
-            try:
-                for future in as_completed(futures):
-                    missing += future.result()
-                    drawn += futures[future]
-                    progress(drawn)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # or leaving would first draw all that is still to come
-                raise
+            for future in as_completed(futures):
+                missing += future.result()
+                drawn += futures[future]
+                progress(drawn)
     rows = TensorDict.load_memmap(out / "rows")
     _refill(rows, sorted(missing), count)
     finish(out, recipe, refilled=len(missing))
@@ -195,19 +188,6 @@ def _rows(folder: Path) -> TensorDictBase:
 
 def _quiet() -> None:
     torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
-
-
-@contextmanager
-def _no_interrupt() -> Iterator[None]:
-    """Processes that start in this context ignore Ctrl-C, which reaches the whole group: their parent ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
 
 
 def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:

@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.children import withheld
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.models.artflownet import ArtFlowNet
@@ -136,10 +137,11 @@ class _Contenders:
         self.processes: dict[str, subprocess.Popen[str]] = {}
         for name in names:
             path = os.pathsep.join(entry for entry in (*sys.path, str(peer or "")) if entry)
-            self.processes[name] = subprocess.Popen(
-                [sys.executable, "-m", __name__, name, str(clouds), "cpu" if name.startswith("peer") else device],
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path},
-            )  # fmt: skip
+            with withheld():
+                self.processes[name] = subprocess.Popen(
+                    [sys.executable, "-m", __name__, name, str(clouds), "cpu" if name.startswith("peer") else device],
+                    stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path},
+                )  # fmt: skip
 
     def __enter__(self) -> _Contenders:
         return self

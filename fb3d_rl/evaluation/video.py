@@ -19,6 +19,7 @@ from tensordict.nn import TensorDictModuleBase
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.shade import GRIPPER, TARGET, Body, Camera, Color, Part, Placed, Studio, link_colors, srgb
 from fb3d_rl.camera.views import View, look_at
+from fb3d_rl.children import withheld
 from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.evaluation.film import Film, record
@@ -348,7 +349,8 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View
             ffmpeg_log_level="error",
             output_params=options + same,
         )
-        writer.send(None)
+        with withheld():
+            writer.send(None)  # starts ffmpeg
         for image in frames(film, size, view):
             writer.send(image)
         for _ in range(round(HOLD * film.rate)):

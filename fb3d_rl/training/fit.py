@@ -28,7 +28,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 from torch.optim.swa_utils import get_ema_multi_avg_fn as ema_of
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.contract import Interrupted, UserError
 from fb3d_rl.training.processes import rank_and_count
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
@@ -331,8 +331,8 @@ def fit(
         model ends with the averaged weights, "average"; the last ones are "model", to go on from.
 
     Raises:
-        UserError: there are no rows, the state belongs to other options, the loss is not finite, or Ctrl-C was
-            pressed (after the checkpoint).
+        UserError: there are no rows, the state belongs to other options, or the loss is not finite.
+        Interrupted: Ctrl-C was pressed (after the checkpoint).
     """
     tune_cpu()
     rows, (rank, processes) = len(buffer), rank_and_count()
@@ -425,7 +425,7 @@ def fit(
                 on_checkpoint(state())
             if stopped:
                 saved = "a checkpoint was saved, resume from it to go on" if on_checkpoint else "nothing was saved"
-                raise UserError(f"Stopped by Ctrl-C after step {step} of {options.steps}: {saved}.")
+                raise Interrupted(f"Stopped by Ctrl-C after step {step} of {options.steps}: {saved}.")
             if late:
                 break
     last = state()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -29,6 +30,72 @@ def group(number: int) -> list[str]:
 
 def workers(number: int) -> int:
     return sum("spawn_main" in command for command in group(number))
+
+
+COMMANDS = {
+    "train": ["train.py", "experiment=smoke"],
+    "evaluate": ["evaluate.py", "collector.workers=2"],
+    "view": ["view.py", "port=18090"],
+    "validate": ["objects.py", "validate", "ROOT", "--workers", "2", "--out", "validation.json"],
+    "list": ["objects.py", "list", "ROOT"],
+    "preview": ["objects.py", "preview", "ROOT", "--out", "sheet.png"],
+    "generate": ["objects.py", "generate", "--out", "made"],
+    "unpack": ["objects.py", "unpack", "objects.zip", "--out", "unpacked"],
+    "record": ["demos.py", "record", "demos", "--trials", "2", "--workers", "2"],
+    "report": ["report.py", "ROOT"],
+    "benchmark": ["benchmark.py", "network", "--rounds", "1"],
+    "export": ["export.py", "pretrained", "net.pt2"],
+}
+SOME = {("validate", 0.05), ("train", 0.4), ("evaluate", 1.5), ("report", 0.1), ("record", 0.8)}
+# Python's own start, before the first line of the script, is not the script's to guard.
+START = """
+import os, runpy, sys
+sys.argv = sys.argv[1:]
+sys.path.insert(0, os.path.dirname(sys.argv[0]))
+os.write(1, b"up")
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="needs groups of processes")
+@pytest.mark.parametrize(
+    ("name", "after"),
+    [
+        pytest.param(name, after, marks=() if (name, after) in SOME else pytest.mark.slow)
+        for name in COMMANDS
+        for after in (0.05, 0.1, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)
+    ],
+)
+def test_a_command_ends_in_one_line_whenever_it_is_interrupted(
+    tmp_path: Path, procedural_root: Path, name: str, after: float
+) -> None:
+    if name == "unpack":
+        shutil.make_archive(str(tmp_path / "objects"), "zip", procedural_root)
+    words = [word.replace("ROOT", str(procedural_root)) for word in COMMANDS[name]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-c", START, str(ROOT / "launch" / words[0]), *words[1:]],
+        cwd=tmp_path,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    ) as process:
+        assert process.stdout is not None and process.stdout.read(2) == "up"
+        time.sleep(after)
+        if process.poll() is not None:
+            return  # it was quicker
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    if process.returncode == 0:  # it was just about to end, or served its page until then
+        assert not said
+    else:
+        assert process.returncode == 2 and said.count("\n") == 1, said
+        assert said.startswith(("error: interrupted", "error: Stopped by Ctrl-C")), said
+    time.sleep(0.2)
+    assert group(process.pid) == []
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 import pytest
+import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 Launch: TypeAlias = "Callable[..., subprocess.CompletedProcess[str]]"
@@ -126,6 +127,50 @@ def test_the_live_page_says_what_is_wrong_and_leaves_nothing(
     sentence = sentence_of(launch("view.py", *arguments, cwd=tmp_path))
     assert all(word in sentence for word in words), sentence
     assert not list(tmp_path.iterdir())
+
+
+def test_a_job_that_fails_stops_no_other_and_is_named(tmp_path: Path) -> None:
+    small = ["experiment=smoke", "evaluation.trials=0", "assets.categories=[Box]"]
+    swept = (
+        ["policy=artflownet,expert", "device=cpu,cuda"]
+        if not torch.cuda.is_available()
+        else ["policy=artflownet,expert"]
+    )
+    result = start("evaluate.py", "-m", *small, *swept, "hydra.sweep.dir=sweep", cwd=tmp_path)
+    assert result.returncode == 2 and "Traceback" not in result.stderr
+    (finished,) = (tmp_path / "sweep").rglob("summary.json")
+    assert "policy=expert" in finished.parent.name
+    lines = result.stderr.splitlines()
+    count = len(lines) // 2
+    assert lines[count] == f"error: {count} of {count + 1} jobs failed:"
+    assert [line.removeprefix("error: ") for line in lines[:count]] == [line.strip() for line in lines[count + 1 :]]
+    assert lines[0].startswith("error: job 0 (policy=artflownet") and "checkpoint=PATH" in lines[0]
+    assert not [folder for folder in (tmp_path / "sweep").iterdir() if folder != finished.parent and folder.is_dir()]
+
+
+@pytest.mark.slow
+def test_a_fault_of_the_program_stops_no_other_job(tmp_path: Path) -> None:
+    program = f"""
+import runpy, sys
+sys.path.insert(0, {str(ROOT / "launch")!r})
+sys.argv = ["evaluate.py", "-m", "seed=0,1,2", "hydra.sweep.dir=sweep"]
+import command
+def task(cfg, out):
+    if cfg.seed == 0:
+        raise ZeroDivisionError("a fault")
+    if cfg.seed == 2:
+        raise KeyboardInterrupt if {{stop}} else command.Interrupted("Stopped by Ctrl-C")
+    (out / "done").touch()
+command.main("evaluate", task)
+"""
+    for stop in (True, False):
+        environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+        command = [sys.executable, "-c", program.replace("{stop}", str(stop))]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 2, done.stderr
+        assert "ZeroDivisionError: a fault" in done.stderr and len(list(tmp_path.rglob("done"))) == 1
+        last = "interrupted" if stop else "Stopped"
+        assert done.stderr.splitlines()[-1].startswith(f"error: job 2 (seed=2): {last}")
 
 
 @pytest.mark.slow
