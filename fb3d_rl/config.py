@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.contract import UNTRAINED, UserError
 
 
 @dataclass
@@ -367,9 +367,6 @@ class EvaluateConfig(CommandConfig):
     checkpoint: str | None
     resume: bool
 
-
-UNTRAINED = ("expert", "random", "normal")
-"""Policies that need no checkpoint."""
 
 TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
 """What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""

@@ -9,9 +9,9 @@ Definitions
     view) and every one of these ended alike; what ended otherwise stands apart under the name of its group.
 
 Intervals
-    As in :mod:`fb3d_rl.evaluation.tables`: objects are resampled, and all trials of an object, those of all seeds,
-    stay together, since several seeds on the same objects are no more objects. Differences are taken trial by
-    trial between policies that ran the same trials, and objects are resampled likewise.
+    As in :mod:`fb3d_rl.evaluation.tables`: an object is the unit, with all its trials, those of all seeds, since
+    several seeds on the same objects are no more objects. Differences are taken trial by trial between policies that
+    ran the same trials, and objects are the unit likewise.
 """
 
 from __future__ import annotations
@@ -36,15 +36,17 @@ from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCE
 from fb3d_rl.files import write_text
 
 METHOD = (
-    ("Interval", f"95 %: objects are resampled (bootstrap, {tables.RESAMPLES} times) and all trials of an object, over "
-     "all seeds, stay together. It tells how the mean would vary with other objects, for the networks as they were "
-     "trained; how it varies with training is the range over seeds."),
+    ("Interval", "95 %, with an object as the unit: its trials, over all seeds, are no more objects. It tells how the "
+     "mean would vary with other objects, for the networks as they were trained; how it varies with training is the "
+     "range over seeds."),
+    ("Seeds", "of the runs that stand behind a row. Runs of launch/train.py are trainings of their own; those of "
+     "launch/evaluate.py share the training of their checkpoint."),
     ("Range over seeds", "the lowest and the highest seed's instance mean."),
     ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
      "a policy whose repeats differ stands in several rows."),
     ("Difference", "between two policies on the trials that both ran (same seed, object, part and view), trial by "
-     "trial, as a mean over objects; its interval resamples objects likewise. There is none if all objects differ "
-     "by the same."),
+     "trial, as a mean over objects; its interval has objects as the unit likewise. Where all are "
+     "tied, it says how many could differ unseen."),
     ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
      "those steps in which the expert also acted."),
 )  # fmt: skip

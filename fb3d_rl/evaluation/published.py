@@ -10,6 +10,7 @@ from typing import Any
 
 from fb3d_rl.assets.splits import UMPNET_SPLIT
 from fb3d_rl.contract import UserError
+from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, policies
 from fb3d_rl.evaluation.runs import Run
 from fb3d_rl.evaluation.tables import FLOW, SUCCESS, Interval, Means, Metric, measure
@@ -46,7 +47,7 @@ def paper(run: Run, variant: str) -> str:
         "",
         f"Ours: `{facts.get('command', 'unknown command')}`, seed {facts.get('seed')}, revision "
         f"{str(facts.get('git_revision'))[:7]}, {facts.get('machine', 'unknown machine')}. In brackets 95 % intervals "
-        "(objects resampled), n the number of objects. Bold: the better mean.",
+        f"(an object is the unit), n the number of objects. Bold: the better mean. {tables.trainings(facts)}".rstrip(),
         *_flow(run.flow_all_parts, variant),
         *_success(run.rows),
         "",

@@ -8,6 +8,7 @@ import math
 import re
 import runpy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -256,18 +257,13 @@ def test_more_seeds_on_the_same_objects_are_no_more_evidence(tmp_path: Path) -> 
 
 
 def test_the_interval_is_the_binomials_where_each_object_has_one_trial(tmp_path: Path) -> None:
-    """Resampling n objects of which k succeed draws from Binomial(n, k / n) / n: its quantiles are known."""
-    from scipy.stats import binom
-
     write_run(tmp_path / "run", "bc", 0, trials("bc", 0, skill))
-    low, high = compared(tmp_path).numbers["bc/success_rate_ci95"]
-    n = len(OBJECTS)
-    expected = binom.ppf([0.025, 0.975], n, 0.5) / n
-    assert (low, high) == pytest.approx(expected, abs=1e-12)
+    expected = binomtest(len(OBJECTS) // 2, len(OBJECTS)).proportion_ci(method="exact")
+    assert compared(tmp_path).numbers["bc/success_rate_ci95"] == pytest.approx((expected.low, expected.high))
 
 
-def test_an_even_outcome_has_wilsons_interval_of_the_objects(found: Comparison) -> None:
-    expected = binomtest(len(OBJECTS), len(OBJECTS)).proportion_ci(method="wilson")
+def test_an_even_outcome_has_the_interval_of_the_objects_not_of_the_trials(found: Comparison) -> None:
+    expected = binomtest(len(OBJECTS), len(OBJECTS)).proportion_ci(method="exact")
     assert found.numbers["expert/success_rate_ci95"] == pytest.approx((expected.low, expected.high))
 
 
@@ -293,24 +289,26 @@ def test_differences_by_hand(found: Comparison) -> None:
 
 def test_pairing_removes_what_both_share() -> None:
     """Objects that are easy or hard for both widen each mean's interval, not that of the difference."""
-    rng = np.random.default_rng(0)
-    easy = (rng.random(len(OBJECTS)) < 0.5).tolist()
+    easy = [i % 2 == 0 for i in range(12)]
     better = [*easy]
-    better[easy.index(False)] = True
-    paired = difference(pairs_of(better, easy), SUCCESS)
-    assert paired.instance == pytest.approx(1 / len(OBJECTS)) and paired.instance_ci95 is not None
+    better[1] = True
+    rows = pairs_of(better, easy) + 5 * pairs_of(easy, easy)
+    pairs = [(replace(a, object=str(i)), replace(b, object=str(i))) for i, (a, b) in enumerate(rows)]
+    paired = difference(pairs, SUCCESS)
+    assert paired.instance == pytest.approx(1 / len(pairs)) and paired.instance_ci95 is not None
     low, high = paired.instance_ci95
-    alone = tables.measure([b for _, b in pairs_of(better, easy)], SUCCESS).instance_ci95
+    alone = tables.measure([b for _, b in pairs], SUCCESS).instance_ci95
     assert alone is not None and high - low < 0.6 * (alone[1] - alone[0])
     same = difference(pairs_of(easy, easy), SUCCESS)
-    assert (same.instance, same.instance_ci95) == (0.0, None)
+    assert same.instance == 0 and same.instance_ci95 is not None, "ties are no certainty"
+    assert same.instance_ci95[0] == pytest.approx(-same.instance_ci95[1]) and 0.1 < same.instance_ci95[1] < 0.35
 
 
 def test_a_difference_turns_its_sign_with_its_sides() -> None:
     one, two = [i < 9 for i in range(12)], [i % 2 == 0 for i in range(12)]
     there, back = difference(pairs_of(one, two), SUCCESS), difference(pairs_of(two, one), SUCCESS)
     assert there.instance == pytest.approx(-(back.instance or 0)) and there.instance_ci95 and back.instance_ci95
-    assert there.instance_ci95 == pytest.approx((-back.instance_ci95[1], -back.instance_ci95[0]), abs=0.1)
+    assert there.instance_ci95 == pytest.approx((-back.instance_ci95[1], -back.instance_ci95[0]))
 
 
 def test_intervals_of_differences_hold_their_truth() -> None:
@@ -445,7 +443,7 @@ def test_the_page_is_whole_and_loads_nothing(page: Page) -> None:
 def test_the_page_tells_what_was_left_out_and_how_numbers_come_about(page: Page) -> None:
     shown = " ".join(page.text)
     for words in (
-        "algo=dagger,seed=3", "Comparison of 9 runs", "objects are resampled", "Minus bc", "Minus expert", "+25",
+        "algo=dagger,seed=3", "Comparison of 9 runs", "an object as the unit", "Minus bc", "Minus expert", "+25",
         "5,030", "58 %", "Category2", "Split test", "cafe01",
     ):  # fmt: skip
         assert words in shown, words

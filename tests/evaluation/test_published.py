@@ -64,6 +64,7 @@ def test_success_is_beside_what_is_published(run: Path) -> None:
     assert "| published: FlowBotHD | | 88.2 % | 93.7 % | 80.5 % | 86.3 % |" in page
     (own,) = [line for line in page.splitlines() if line.startswith("| artflownet |")]
     assert "4, 4 trials" in own and "83.3 %" in own and "75.0 %" in own and "66.7 %" in own
+    assert "One training (one seed)" in page
     assert "11 of" in page  # the supplement's slips
 
 
