@@ -29,7 +29,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from fb3d_rl.evaluation import learning, tables
+from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import Run, labels
 from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCESS, TRIAL, Means, Metric
@@ -48,7 +48,7 @@ METHOD = (
      "trial, as a mean over objects; its interval has objects as the unit likewise. Where all are "
      "tied, it says how many could differ unseen."),
     ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
-     "those steps in which the expert also acted."),
+     "those steps that the expert also made."),
 )  # fmt: skip
 """How the numbers of a comparison come about: (term, meaning)."""
 
@@ -120,15 +120,14 @@ class Entry:
         known = [value for value in found if value is not None]
         return (min(known), max(known)) if len(found) > 1 and known else None
 
-    @property
-    def logs(self) -> list[list[dict[str, Any]]]:
-        """Logs of the runs that made the policy."""
-        return [run.log for run in self.groups[0].runs] if self.own else []
+    def facts(self, key: str) -> list[float | None]:
+        """What the summaries of the runs that made the policy say, of each seed."""
+        return [run.summary.get(key) for run in self.groups[0].runs] if self.own else []
 
     @property
     def labels(self) -> float | None:
         """Labels used, mean over seeds."""
-        return _mean(learning.labels_used(log) for log in self.logs)
+        return _mean(self.facts("labels"))
 
     @property
     def decision_times(self) -> list[float | None]:
@@ -142,8 +141,8 @@ class Entry:
 
     @property
     def expert_share(self) -> float | None:
-        """Share of the collected steps in which the expert acted, mean over seeds."""
-        return _mean(learning.expert_share(log) for log in self.logs)
+        """Share of the labelled steps that the expert also made, mean over seeds."""
+        return _mean(self.facts("expert_share"))
 
 
 @dataclass(frozen=True)
@@ -370,8 +369,8 @@ def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
                     n, measured = tables.counted(rows, metric), tables.measure(rows, metric)
                     yield from _means_rows(about, metric.key, "", measured, n, classes=category == "all")
     for key, values, total in (
-        ("labels", [learning.labels_used(log) for log in entry.logs], entry.labels),
-        ("expert_share", [learning.expert_share(log) for log in entry.logs], entry.expert_share),
+        ("labels", entry.facts("labels"), entry.labels),
+        ("expert_share", entry.facts("expert_share"), entry.expert_share),
         (DECISION.key, entry.decision_times, entry.decision_ms),
     ):
         if total is not None:
