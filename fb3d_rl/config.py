@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.contract import UNTRAINED, UserError
 
 
 @dataclass
@@ -425,9 +425,6 @@ def changes_no_number(key: str) -> bool:
     """Whether a run may go on with another value of this dotted key: where it computes, and where its log goes."""
     return key in ("device", "data.workers") or key.startswith(("collector.", "logger."))
 
-
-UNTRAINED = ("expert", "random", "normal")
-"""Policies that need no checkpoint."""
 
 TRAINED = ("artflownet", "screwnet", "ump_di", "bc", "dagger")
 """What launch/train.py trains, and launch/evaluate.py evaluates from a checkpoint."""

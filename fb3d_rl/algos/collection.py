@@ -37,7 +37,8 @@ class Round:
 
     Attributes:
         episodes: frames [T] with what is known about them; exactly as many as the labels asked for.
-        numbers: of the whole episodes: "collect/success_rate", "collect/contact_rate", "collect/expert_share" ...
+        numbers: "collect/success_rate" and "collect/contact_rate" of the whole episodes, "collect/expert_share" of the
+            labels (see :func:`expert_share`) ...
         ended: when, on the clock of :func:`time.perf_counter`.
     """
 
@@ -73,7 +74,7 @@ def collect(
     """
     categories = {view.obj.id: view.obj.category for view in views}
     episodes: list[tuple[TensorDictBase, EpisodeInfo]] = []
-    outcomes: list[tuple[bool, bool, float]] = []
+    outcomes: list[tuple[bool, bool]] = []
     count, steps, crashed, barren, error, started = 0, 0, 0, 0, "", time.perf_counter()
     while count < labels:
         # A number that depends on the labels alone, so that the workers' number decides nothing.
@@ -92,8 +93,7 @@ def collect(
                 continue
             frames = rows.of(ended[index])
             info = episode_info(trial, categories[trial.object], ended[index], number)
-            outcomes.append((info.success, bool(ended[index]["next", "contact"].any()),
-                             float(ended[index]["expert", "acts"].float().mean())))  # fmt: skip
+            outcomes.append((info.success, bool(ended[index]["next", "contact"].any())))
             if len(frames):
                 barren = 0
             if count < labels and len(frames):
@@ -102,19 +102,28 @@ def collect(
                 count += len(kept)
         if barren >= BARREN:
             raise UserError(f"the last {barren} trials brought no label: {rows.why_none(len(outcomes), error)}")
-    success, contact, share = np.mean(outcomes, axis=0).tolist()
+    success, contact = np.mean(outcomes, axis=0).tolist()
     ended_at = time.perf_counter()
     seconds = ended_at - started
     numbers = {
         "collect/success_rate": success,
         "collect/contact_rate": contact,
-        "collect/expert_share": share,
+        "collect/expert_share": expert_share([frames for frames, _ in episodes]),
         "collect/episodes": len(outcomes),
         "collect/crashed": crashed,
         "time/collect_seconds": seconds,
         "time/labels_per_s": steps / seconds,
     }
     return Round(episodes, numbers, ended_at)
+
+
+def expert_share(rows: Sequence[TensorDictBase]) -> float:
+    """Share of the labelled steps that the expert also made.
+
+    Args:
+        rows: of episodes [T], as they are in the buffer: what has no label in it does not count.
+    """
+    return float(torch.cat([frames["expert", "acts"] for frames in rows]).double().mean())
 
 
 @dataclass(frozen=True)

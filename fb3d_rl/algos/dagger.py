@@ -25,7 +25,7 @@ from torchrl.objectives import BCLoss
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.artflownet import load_network
-from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, relabelled
+from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, expert_share, relabelled
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
@@ -133,6 +133,7 @@ class Run:
         saved = load_checkpoint(out / CHECKPOINT, algo=algo.name) if cfg.resume and not begun else None
         self.resumed = saved is not None
         given = DemonstrationBuffer.open(algo.demonstrations) if algo.demonstrations else None
+        self.given = len(given.episodes) if given else 0
         self.logger = open_logger(cfg.logger.name, cfg.logger.project, out)
 
         self.expert = expert_policy(self.limits, setup.flow_policy_options(cfg))
@@ -302,9 +303,8 @@ class Run:
 
     @property
     def expert_share(self) -> float:
-        """Share of the labelled steps that the expert also made."""
-        acts = [self.buffer.frames(i)["expert", "acts"].float() for i in range(len(self.buffer.episodes))]
-        return float(torch.cat(acts).mean())
+        """See :func:`~fb3d_rl.algos.collection.expert_share`; demonstrations that were given are not counted."""
+        return expert_share([self.buffer.frames(i) for i in range(self.given, len(self.buffer.episodes))])
 
 
 def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:

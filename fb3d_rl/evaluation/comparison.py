@@ -12,9 +12,9 @@ Definitions
     are of the same trial if object, part and seeds are the same and the runs' settings of all that a key tells are.
 
 Intervals
-    As in :mod:`fb3d_rl.evaluation.tables`: objects are resampled, and all trials of an object, those of all seeds,
-    stay together, since several seeds on the same objects are no more objects. Differences are taken trial by
-    trial between policies that ran the same trials, and objects are resampled likewise.
+    As in :mod:`fb3d_rl.evaluation.tables`: an object is the unit, with all its trials, those of all seeds, since
+    several seeds on the same objects are no more objects. Differences are taken trial by trial between policies that
+    ran the same trials, and objects are the unit likewise.
 """
 
 from __future__ import annotations
@@ -32,24 +32,26 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from fb3d_rl.evaluation import learning, tables
+from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import Run, labels
 from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCESS, TRIAL, Means, Metric
 from fb3d_rl.files import write_text
 
 METHOD = (
-    ("Interval", f"95 %: objects are resampled (bootstrap, {tables.RESAMPLES} times) and all trials of an object, over "
-     "all seeds, stay together. It tells how the mean would vary with other objects, for the networks as they were "
-     "trained; how it varies with training is the range over seeds."),
+    ("Interval", "95 %, with an object as the unit: its trials, over all seeds, are no more objects. It tells how the "
+     "mean would vary with other objects, for the networks as they were trained; how it varies with training is the "
+     "range over seeds."),
+    ("Seeds", "of the runs that stand behind a row. Runs of launch/train.py are trainings of their own; those of "
+     "launch/evaluate.py share the training of their checkpoint."),
     ("Range over seeds", "the lowest and the highest seed's instance mean."),
     ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
      "a policy whose repeats differ stands in several rows."),
     ("Difference", "between two policies on the trials that both ran (same object, part, start, goal, view and "
-     "suction), trial by trial, as a mean over objects; its interval resamples objects likewise. There is none if all "
-     "objects differ by the same."),
+     "suction), trial by trial, as a mean over objects; its interval has objects as the unit likewise. Where all are "
+     "tied, it says how many could differ unseen."),
     ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
-     "those steps in which the expert also acted."),
+     "those steps that the expert also made."),
 )  # fmt: skip
 """How the numbers of a comparison come about: (term, meaning)."""
 
@@ -126,15 +128,14 @@ class Entry:
         known = [value for value in found if value is not None]
         return (min(known), max(known)) if len(found) > 1 and known else None
 
-    @property
-    def logs(self) -> list[list[dict[str, Any]]]:
-        """Logs of the runs that made the policy."""
-        return [run.log for run in self.groups[0].runs] if self.own else []
+    def facts(self, key: str) -> list[float | None]:
+        """What the summaries of the runs that made the policy say, of each seed."""
+        return [run.summary.get(key) for run in self.groups[0].runs] if self.own else []
 
     @property
     def labels(self) -> float | None:
         """Labels used, mean over seeds."""
-        return _mean(learning.labels_used(log) for log in self.logs)
+        return _mean(self.facts("labels"))
 
     @property
     def decision_times(self) -> list[float | None]:
@@ -148,8 +149,8 @@ class Entry:
 
     @property
     def expert_share(self) -> float | None:
-        """Share of the collected steps in which the expert acted, mean over seeds."""
-        return _mean(learning.expert_share(log) for log in self.logs)
+        """Share of the labelled steps that the expert also made, mean over seeds."""
+        return _mean(self.facts("expert_share"))
 
 
 @dataclass(frozen=True)
@@ -387,8 +388,8 @@ def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
                     n, measured = tables.counted(rows, metric), tables.measure(rows, metric)
                     yield from _means_rows(about, metric.key, "", measured, n, classes=category == "all")
     for key, values, total in (
-        ("labels", [learning.labels_used(log) for log in entry.logs], entry.labels),
-        ("expert_share", [learning.expert_share(log) for log in entry.logs], entry.expert_share),
+        ("labels", entry.facts("labels"), entry.labels),
+        ("expert_share", entry.facts("expert_share"), entry.expert_share),
         (DECISION.key, entry.decision_times, entry.decision_ms),
     ):
         if total is not None:

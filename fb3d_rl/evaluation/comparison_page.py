@@ -99,7 +99,7 @@ def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") 
         body += "".join(f"<td>{numbers[f'{entry.label}/{key}']}</td>" for key in ("n", "n_objects"))
         body += f"<td>{text(comparison.show_seeds(entry))}</td>"
         body += "</tr>"
-    note = "" if split else '<p class="soft">Small print: 95 % intervals from resampling objects, see below.</p>'
+    note = "" if split else '<p class="soft">Small print: 95 % intervals with objects as the unit, see below.</p>'
     return note + page.plain_table([*head, "trials", "objects", "seeds"], body)
 
 

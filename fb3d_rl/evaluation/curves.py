@@ -17,7 +17,7 @@ DASHES = ("solid", "dot", "dash")
 LEARNING = {
     "success": {"val/success_rate": "validation", "collect/success_rate": "while collecting"},
     "contact": {"val/contact_rate": "validation", "collect/contact_rate": "while collecting"},
-    "expert": {"collect/expert_share": "share of steps", "beta": "beta"},
+    "expert": {"collect/expert_share": "share of labels", "beta": "beta"},
     "loss": {"train/loss": "training", "val/loss": "validation"},
 }
 """Panels of a run's learning curve: title -> key in the log -> what it is."""

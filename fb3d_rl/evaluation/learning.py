@@ -1,4 +1,4 @@
-"""What the log of a behaviour-cloning or DAgger run tells about labels: rounds, learning curves, the expert's share."""
+"""What the log of a behaviour-cloning or DAgger run tells about labels: rounds and learning curves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, TypeGuard
 
 LABELS, ROUND = "labels", "round"
-SHARE = "collect/expert_share"
 SUCCESSES = {
     "val/success_rate": "validation success while training",
     "collect/success_rate": "success while collecting",
@@ -34,22 +33,6 @@ def rounds(log: Iterable[Mapping[str, Any]]) -> list[dict[str, float]]:
             known = found.setdefault(number, {ROUND: number})
             known.update((key, value) for key, value in row.items() if is_number(value))
     return [found[key] for key in sorted(found)]
-
-
-def labels_used(log: Iterable[Mapping[str, Any]]) -> float | None:
-    """Labels that the run has learned from at its end; None for a run that counts none."""
-    return max((row[LABELS] for row in rounds(log)), default=None)
-
-
-def expert_share(log: Iterable[Mapping[str, Any]]) -> float | None:
-    """Share of the collected steps that the expert acted in: the mean over rounds, weighted by their new labels."""
-    before, steps, total = 0.0, 0.0, 0.0
-    for row in rounds(log):
-        new, before = row[LABELS] - before, row[LABELS]
-        if SHARE in row:
-            steps += new * row[SHARE]
-            total += new
-    return steps / total if total > 0 else None
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,8 @@ def _headline(numbers: Mapping[str, Any]) -> str:
         blocks.append(page.cards(_card(m, numbers, prefix) for m in shown))
     if not blocks:
         return ""
-    return "".join(blocks) + page.facts(terms([numbers]))
+    told = tables.trainings(numbers)
+    return "".join(blocks) + f'<p class="soft">{text(told)}</p>' * bool(told) + page.facts(terms([numbers]))
 
 
 def _success_bars(numbers: Mapping[str, Any]) -> str:

@@ -43,7 +43,7 @@ class TrialRow:
     Attributes:
         trial: index in the schedule, shared by all policies.
         policy: "expert", "artflownet", ...
-        object: the object's id; together with ``category`` the unit that is resampled for the intervals.
+        object: the object's id; together with ``category`` the unit of the intervals.
         category: the object's category.
         split: the split that the object belongs to.
         link: name of the link to open.

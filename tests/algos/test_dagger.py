@@ -9,14 +9,19 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 
+from fb3d_rl.algos import collection
 from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
 from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.env.workers import Episode
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import twist_of
@@ -94,9 +99,32 @@ def test_rounds_labels_and_who_acts(first: Path) -> None:
         (1, 90, 0.0, 8),
     ]
     assert all("val/success_rate" in row for row in log)
+    assert [row["collect/expert_share"] for row in log] == [1, 0]
     summary = json.loads((first / "summary.json").read_text())
     assert summary["labels"] == 90 and summary["expert_share"] == 0.5
     assert [row.policy for row in read_trials(first / "rows.csv")] == ["expert", "dagger"]
+
+
+def test_the_experts_share_is_of_the_labelled_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With an oracle the expert drives to the part, which no label is asked for; the last episode is cut."""
+    acts = [[1, 1, 1, 0, 0, 1], [1, 0, 0, 0, 1, 1, 1, 1]]
+    labelled = [[0, 0, 0, 1, 1, 1], [0, 1, 1, 1, 1, 1, 1, 1]]
+    episodes = [
+        TensorDict(
+            {"expert": {"acts": torch.tensor(made, dtype=torch.bool)[:, None]}, "labelled": torch.tensor(asked) > 0,
+             "next": {"contact": torch.ones(len(made), 1, dtype=torch.bool)}}, [len(made)])
+        for made, asked in zip(acts, labelled, strict=True)
+    ]  # fmt: skip
+    trials = [SimpleNamespace(object="a"), SimpleNamespace(object="a")]
+    monkeypatch.setattr(collection, "draw_trials", lambda *_: trials)
+    monkeypatch.setattr(collection, "episode_info", lambda *_: SimpleNamespace(success=True))
+    workers = SimpleNamespace(run=lambda *_: [Episode(i, frames) for i, frames in enumerate(episodes)])
+    rows = SimpleNamespace(keys=list, of=lambda frames: frames[frames["labelled"]])
+    views = [SimpleNamespace(obj=SimpleNamespace(id="a", category="Oven"))]
+    found = collection.collect(*cast("Any", (workers, views, None, rows, 0, 7, np.random.default_rng(0))))
+    kept = torch.cat([frames["expert", "acts"] for frames, _ in found.episodes]).flatten()
+    assert kept.tolist() == [0, 0, 1, 0, 0, 0, 1]
+    assert found.numbers["collect/expert_share"] == kept.double().mean() == 2 / 7
 
 
 def test_a_row_holds_the_experts_label_whoever_acted(first: Path) -> None:
@@ -205,6 +233,12 @@ def test_every_variant_runs(tmp_path: Path, overrides: list[str], train: Train) 
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["labels"] == 90 and 0 < summary["expert_share"] <= 1
     assert {row.policy for row in read_trials(tmp_path / "rows.csv")} == {"expert", summary["policy"]}
+    buffer = DemonstrationBuffer.open(tmp_path / BUFFER)
+    assert summary["expert_share"] == pytest.approx(buffer[torch.arange(90)]["expert", "acts"].double().mean().item())
+    log = [row for row in read_rows(tmp_path / "metrics.jsonl") if "labels" in row]
+    new = np.diff([0, *(row["labels"] for row in log)])
+    shares = [row["collect/expert_share"] for row in log]
+    assert summary["expert_share"] == pytest.approx(np.average(shares, weights=new)), "the log and the summary agree"
     if "oracle" in algo:  # the learner is trained on held parts, where it acts
         rows = DemonstrationBuffer.open(tmp_path / BUFFER)
         assert rows[torch.arange(len(rows))]["observation", "attached"].all()

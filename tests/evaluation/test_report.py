@@ -166,8 +166,18 @@ def test_nothing_is_loaded_from_elsewhere(run: Path, page: Page) -> None:
 
 def test_numbers_and_facts_are_on_the_page(page: Page) -> None:
     shown = " ".join(page.text)
-    for word in ("cafe01", "0.80", "29 %", "artflownet", "expert", "class mean", "instance mean"):
+    for word in (
+        "cafe01",
+        "0.80",
+        "29 %",
+        "artflownet",
+        "expert",
+        "class mean",
+        "instance mean",
+        "One training (one seed)",
+    ):
         assert word in shown, word
+    assert "One training (one seed)" in shown
 
 
 def test_lost_geometry_is_on_the_page(page: Page) -> None:

@@ -9,7 +9,7 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow
-from fb3d_rl.evaluation.tables import means, number_rows, show, summary, wilson
+from fb3d_rl.evaluation.tables import UNIT, means, number_rows, show, summary, trainings, wilson
 
 
 def trial(category: str, object_: str, success: bool, contact: bool = True, **changes: object) -> TrialRow:
@@ -96,13 +96,27 @@ def test_what_it_took_counts_the_trials_that_it_is_about() -> None:
         show(numbers, console)
     printed = console.export_text()
     assert "What it took" in printed
-    assert printed.splitlines()[-1].split() == ["artflownet", "60", "3.0", "3.00", "2.25", "12.3"]
+    assert printed[: printed.index("One training")].splitlines()[-1].split() == [
+        "artflownet",
+        "60",
+        "3.0",
+        "3.00",
+        "2.25",
+        "12.3",
+    ]
 
     early = summary([trial("Oven", "a", False)], [])  # recorded before these numbers were
     assert early["path_length"] is early["times_lost"] is early["seconds_to_success"] is None
     with Console(width=100, record=True, file=io.StringIO()) as console:
         show(early, console)
     assert "What it took" not in console.export_text()
+
+
+def test_seeds_are_told_where_something_was_trained() -> None:
+    untrained = [trial("Oven", "a", True, policy=policy) for policy in ("expert", "random", "normal")]
+    assert trainings(summary(untrained, [])) == ""
+    assert "One training (one seed)" in trainings(summary([*untrained, trial("Oven", "a", True)], []))
+    assert "One training (one seed)" in trainings(summary(untrained, FLOW))
 
 
 def test_splits_are_told_apart() -> None:
@@ -134,7 +148,7 @@ def objects(n: int, seed: int) -> dict[tuple[str, str], float]:
 def test_intervals_hold_their_mean_and_shrink_with_n(seed: int) -> None:
     widths = []
     for n in (20, 80, 320):
-        result = means(objects(n, seed), proportion=True)
+        result = means(objects(n, seed), UNIT, share=True)
         for mean, interval in (
             (result.instance, result.instance_ci95),
             (result.class_, result.class_ci95),
@@ -147,29 +161,39 @@ def test_intervals_hold_their_mean_and_shrink_with_n(seed: int) -> None:
         assert 0.3 < small / large < 0.75
 
 
-def test_intervals_cover_the_truth() -> None:
-    """The nominal 95 % are reached within the noise of 150 simulated test sets of five categories."""
-    held = 0
-    for seed in range(150):
-        interval = means(objects(60, seed), proportion=True).class_ci95
-        assert interval is not None
-        held += interval[0] <= 0.6 <= interval[1]
-    assert 0.88 <= held / 150 <= 1.0
-
-
 def test_trials_of_one_object_are_no_independent_evidence() -> None:
     few = summary([trial("Oven", str(i), i < 3) for i in range(6)], [])
     many = summary([trial("Oven", str(i), i < 3) for i in range(6) for _ in range(10)], [])
     assert few["success_rate_ci95"] == many["success_rate_ci95"]
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0])
-def test_equal_values_get_wilsons_interval(value: float) -> None:
-    result = means({("Oven", str(i)): value for i in range(7)}, proportion=True)
-    expected = binomtest(int(7 * value), 7).proportion_ci(method="wilson")
-    assert result.instance_ci95 == pytest.approx((expected.low, expected.high))
-    assert result.class_ci95 == result.instance_ci95
-    assert means({("Oven", "a"): value}, proportion=False).instance_ci95 is None
+@pytest.mark.parametrize("count", [0, 1, 5, 7])
+def test_the_interval_is_clopper_and_pearsons_or_wilsons_where_each_object_has_one_trial(count: int) -> None:
+    result = means({("Oven", str(i)): float(i < count) for i in range(7)}, UNIT, share=True)
+    both = [binomtest(count, 7).proportion_ci(method=method) for method in ("exact", "wilson")]
+    assert result.instance_ci95 == pytest.approx((min(ci.low for ci in both), max(ci.high for ci in both)))
+    assert result.class_ci95 == pytest.approx(result.instance_ci95)
+
+
+def test_equal_values_tell_nothing_about_an_unbounded_mean_but_something_about_a_bounded_one() -> None:
+    same = {("Oven", str(i)): 0.5 for i in range(7)}
+    assert means(same).instance_ci95 is means(same).class_ci95 is None
+    bounded = means(same, UNIT).instance_ci95
+    assert bounded is not None and 0.1 < bounded[0] < 0.45 and 0.55 < bounded[1] < 0.9
+
+
+def test_values_beyond_their_bounds_lie_in_the_interval() -> None:
+    """A part that ended further closed than it started has a distance above 1."""
+    result = means({("Oven", "a"): 1.25, ("Oven", "b"): 1.25}, UNIT)
+    assert result.instance == 1.25 and result.instance_ci95 is not None
+    assert result.instance_ci95[0] < 0.5 and result.instance_ci95[1] == 1.25
+
+
+def test_a_class_mean_of_few_objects_that_weigh_much_is_less_certain() -> None:
+    objects_ = {("Oven", str(i)): float(i % 4 > 0) for i in range(20)} | {("Safe", "x"): 1.0}
+    result = means(objects_, UNIT, share=True)
+    assert result.instance_ci95 is not None and result.class_ci95 is not None
+    assert np.ptp(result.class_ci95) > 1.5 * np.ptp(result.instance_ci95)
 
 
 def test_wilson_agrees_with_scipy_on_whole_counts() -> None:
