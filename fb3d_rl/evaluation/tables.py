@@ -25,10 +25,10 @@ Intervals
     trials, true rates of .5 to .99, objects alike or not: the true mean in 95 % of the sets or more, at 1.05 times
     the width of Wilson's intervals on average. (Percentiles of a bootstrap over objects: 10 % at worst, 82 % on
     average; Wilson's 86 % at worst.) Class means, 3 to 16 categories of 1 to 40 objects, alike or not: 95 % or more
-    (bootstrap 38 % and 82 %, Wilson's 88 % at worst); but 80 % where a category's only object is all that can go
-    either way. Differences of policies that are nearly always tied: 95 % or more. Test sets of 10 to 50 objects drawn
-    from those in results/: normalized distance and cosine 97 % or more; RMSE 87 to 95 %, magnitude error 90 to 95 %,
-    since few objects with large errors are easily missed.
+    (bootstrap 38 % at worst, Wilson's 88 %); but 80 % where a category's only object is all that can go either way.
+    Differences of policies that are nearly always tied: 95 % or more. Test sets of 10 to 50 objects drawn from those
+    in results/: normalized distance and cosine 96 % or more; RMSE 87 to 95 %, magnitude error 90 to 95 %, since few
+    objects with large errors are easily missed.
 """
 
 from __future__ import annotations
