@@ -31,7 +31,7 @@ from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, 
 from fb3d_rl.evaluation.tables import DECISION, show, summary
 from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule, trial_key
 from fb3d_rl.evaluation.video import film_trials
-from fb3d_rl.files import write_text
+from fb3d_rl.files import replacing, write_text
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.training.run_log import read_rows
@@ -281,12 +281,13 @@ def _keep_clouds(path: Path, samples: Any, predicted: torch.Tensor, about: Seque
         for i in chosen
     ]
     kept = samples[torch.tensor(chosen)]
-    np.savez_compressed(
-        path,
-        points=kept["observation", "points"].numpy(),
-        valid=kept["observation", "valid"].numpy(),
-        part_mask=kept["observation", "part_mask"].numpy(),
-        flow_true=kept["privileged", "flow"].numpy(),
-        flow_predicted=predicted[torch.tensor(chosen)].numpy(),
-        title=np.array(titles),
-    )
+    with replacing(path) as beside:
+        np.savez_compressed(
+            beside,
+            points=kept["observation", "points"].numpy(),
+            valid=kept["observation", "valid"].numpy(),
+            part_mask=kept["observation", "part_mask"].numpy(),
+            flow_true=kept["privileged", "flow"].numpy(),
+            flow_predicted=predicted[torch.tensor(chosen)].numpy(),
+            title=np.array(titles),
+        )

@@ -304,6 +304,7 @@ def test_bad_input_ends_with_one_sentence_and_exit_code_2(
         ("summary.json", "[]"),
         ("metrics.jsonl", "nonsense\n"),
         ("clouds.npz", "nonsense"),
+        ("clouds.npz", ""),
         ("rows.csv", "nonsense"),
     ],
 )
