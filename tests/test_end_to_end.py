@@ -114,6 +114,23 @@ def test_a_resumed_run_equals_a_straight_one(first: Path, tmp_path: Path, config
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
 
 
+def test_a_run_that_ended_before_its_first_checkpoint_begins_anew(
+    first: Path, tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = [*SMALL, "evaluation.trials=0"]
+
+    def interrupted(log: RunLog, row: dict[str, object]) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(RunLog, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            run(config("train", words), tmp_path)
+    assert not (tmp_path / "checkpoint.pt").exists() and (tmp_path / "samples" / "samples.json").is_file()
+    run(config("train", [*words, "resume=true"]), tmp_path)
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(first / "metrics.jsonl", times=False)
+
+
 def test_a_kept_data_set_gives_the_same_run(first: Path, tmp_path: Path, config: Config) -> None:
     own = [*SMALL, "evaluation.trials=0", "data.train_samples=1"]  # which does not matter then
     run(config("train", [*own, f"data.dataset={first / 'samples'}"]), tmp_path)

@@ -69,7 +69,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     device = protocol.device
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     name, kind = cfg.algo.name, KINDS[cfg.algo.name]
-    resume = load_checkpoint(out / CHECKPOINT, algo=name) if cfg.resume else None
+    resume = state_before(cfg, out)
     logger = open_logger(cfg.logger.name, cfg.logger.project, out)
     options, net = fit_options(cfg), new_network(cfg)
     if resume is not None:
@@ -133,6 +133,12 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     return evaluate(out, objects, policies, protocol, setup.facts(cfg, train), net if kind.flow else None)
 
 
+def state_before(cfg: TrainConfig, out: Path) -> dict[str, Any] | None:
+    """The checkpoint to go on from. A run that ended before its first one has lost nothing: it begins anew."""
+    path = out / CHECKPOINT
+    return load_checkpoint(path, algo=cfg.algo.name) if cfg.resume and path.exists() else None
+
+
 def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:
     """Samples of the validation objects, some ``VALIDATION_SAMPLES`` in all; None where there is no object."""
     objects = setup.load(entries)
@@ -162,7 +168,7 @@ def require_unseen(dataset: Path, entries: list[Entry]) -> None:
 def assist(cfg: TrainConfig, out: Path) -> None:
     """Fit beside the first of several processes, which does all the rest, once the samples are there."""
     device, options = setup.choose_device(cfg.device), fit_options(cfg)
-    resume = load_checkpoint(out / CHECKPOINT, algo=cfg.algo.name) if cfg.resume else None
+    resume = state_before(cfg, out)
     net = new_network(cfg)
     wait_for_all()
     rows, state = training_rows(cfg, out), resume["state"] if resume else None
