@@ -166,9 +166,11 @@ command.main("evaluate", task)
     for stop in (True, False):
         environment = {**os.environ, "PYTHONPATH": str(ROOT)}
         command = [sys.executable, "-c", program.replace("{stop}", str(stop))]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        folder = tmp_path / str(stop)
+        folder.mkdir()
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 2, done.stderr
-        assert "ZeroDivisionError: a fault" in done.stderr and len(list(tmp_path.rglob("done"))) == 1
+        assert "ZeroDivisionError: a fault" in done.stderr and len(list(folder.rglob("done"))) == 1
         last = "interrupted" if stop else "Stopped"
         assert done.stderr.splitlines()[-1].startswith(f"error: job 2 (seed=2): {last}")
 
