@@ -41,7 +41,7 @@ def write_run(run: Path, policy: str, seed: int = 0) -> Path:
                     semantic="lid", joint_type="revolute", seed=i, status="error" if crashed else "ok",
                     error="Boom: <b>1</b>" if crashed else "", steps=150 if failure else 30 + i,
                     contact=failure not in ENDS[3:], success=not failure,
-                    normalized_distance=1.0 if failure else 0.05, failure=failure,
+                    normalized_distance=1.0 if failure else 0.05, failure=failure, key=f"trial {i} of {seed}",
                 )
             )  # fmt: skip
     write_trials(run / "rows.csv", rows)
