@@ -81,17 +81,17 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
                 validate(cfg)
                 task(cfg, out)
                 return
-            fresh = run_folder.is_new(out)
-            try:
-                with run_folder.locked(out):
+            with run_folder.locked(out):
+                fresh = run_folder.is_new(out)
+                try:
                     cfg = OmegaConf.to_object(run_folder.configuration(raw, name, out, schemas))
                     validate(cfg)
                     task(cfg, out)
-            except UserError:
-                # A run that never began leaves no folder.
-                if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
-                    shutil.rmtree(out)
-                raise
+                except UserError:
+                    # A run that never began leaves no folder; only who holds it may take it away.
+                    if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
+                        shutil.rmtree(out)
+                    raise
 
     with _one_sentence():
         job()

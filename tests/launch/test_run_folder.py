@@ -160,6 +160,16 @@ time.sleep(60)
     assert launch("resume=true", "hydra.run.dir=run") == 0 and len(seen) == 1
 
 
+def test_a_folder_that_another_process_has_just_taken_is_left_to_it(
+    launch: Launch, seen: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run").mkdir()
+    with FileLock(tmp_path / "run" / ".lock"):
+        assert launch("hydra.run.dir=run") == 2
+        assert "another process" in capsys.readouterr().err and not seen
+        assert (tmp_path / "run" / ".lock").exists()
+
+
 def test_a_run_holds_its_folder(launch: Launch, run_dir: Path) -> None:
     held = []
 
