@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from fb3d_rl.config import RUN_FILES, changes_no_number
 from fb3d_rl.contract import UserError
+from fb3d_rl.settings import leaves
 
 CONFIG = "config.yaml"
 LOCK = ".lock"
@@ -99,9 +100,9 @@ def _resumed(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> 
     kept = OmegaConf.load(out / CONFIG)
     if not isinstance(kept, DictConfig):
         raise UserError(f"{out / CONFIG} is no configuration of a run; restore the file or begin another run")
-    asked, before = _leaves(raw), _leaves(kept)
-    for key in sorted(_touched(raw, name)):
-        if key != "resume" and not changes_no_number(key) and asked.get(key) != before.get(key):
+    asked, before, touched = _leaves(raw), _leaves(kept), sorted(_touched(raw, name))
+    for key in touched:
+        if not changes_no_number(key) and asked.get(key) != before.get(key):
             raise UserError(
                 f"{out} was begun with {key}={before.get(key)}, not {asked.get(key)}: leave it out to go on, as a "
                 "resumed run takes its settings from its folder, or choose another folder: hydra.run.dir=DIR"
@@ -117,7 +118,7 @@ def _resumed(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> 
             f"{out} was begun with another version of fb3d_rl, without {', '.join(missing[:3])}: go on with that "
             "version, or begin another run"
         )
-    for key in _touched(raw, name):
+    for key in touched:
         if changes_no_number(key):
             OmegaConf.update(config, key, asked[key])
     config.resume = True
@@ -129,13 +130,13 @@ def _touched(raw: DictConfig, name: str) -> set[str]:
     from hydra import compose
 
     keys: set[str] = set()
-    leaves = _leaves(raw)
+    known = _leaves(raw)
     for override in OverridesParser.create().parse_overrides(list(HydraConfig.get().overrides.task)):
         key = override.key_or_group
         if key == "resume":
             continue
-        below = {leaf for leaf in leaves if leaf == key or leaf.startswith(f"{key}.")}
-        if isinstance(override.value(), str) and (Path(_conf()) / key.replace("@", "/")).is_dir():
+        below = {leaf for leaf in known if leaf == key or leaf.startswith(f"{key}.")}
+        if isinstance(override.value(), str) and (Path(_conf()) / key).is_dir():
             # What the group sets: whatever differs from a composition that goes without it.
             without = _leaves(compose(name, [f"~{key}"]))
             alone = _leaves(compose(name, [override.input_line or ""]))
@@ -151,13 +152,5 @@ def _conf() -> str:
 
 def _leaves(config: Any) -> dict[str, Any]:
     """Values by their dotted keys, as YAML has them; a list is one value."""
-    tree = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-
-    def walk(node: Any, prefix: str) -> Iterator[tuple[str, Any]]:
-        for key, value in node.items():
-            if isinstance(value, dict) and value:
-                yield from walk(value, f"{prefix}{key}.")
-            else:
-                yield f"{prefix}{key}", value
-
-    return dict(walk(tree, ""))
+    tree: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    return dict(leaves(tree))

@@ -7,7 +7,7 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fb3d_rl.contract import UserError
 from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_flow, read_trials
+from fb3d_rl.settings import leaves
 
 CLOUD_ARRAYS = ("points", "valid", "part_mask", "flow_true", "flow_predicted", "title")
 
@@ -62,7 +63,7 @@ class Run:
             raise UserError(f"Cannot read {self.path / 'config.yaml'}: it is not valid YAML ({error}).") from error
         if not isinstance(content, dict):
             raise UserError(f"Cannot read {self.path / 'config.yaml'}: it is not a YAML mapping.")
-        return dict(_flat(content, ""))
+        return {key: "null" if value is None else str(value) for key, value in leaves(content)}
 
     @property
     def seed(self) -> int | None:
@@ -71,14 +72,6 @@ class Run:
         if seed is None and self.settings.get("seed", "").isdigit():
             return int(self.settings["seed"])
         return seed if isinstance(seed, int) else None
-
-
-def _flat(content: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, str]]:
-    for key, value in content.items():
-        if isinstance(value, dict) and value:
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", "null" if value is None else str(value)
 
 
 def is_run(path: Path) -> bool:
