@@ -90,8 +90,7 @@ def run(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     train, objects = entries.train, setup.load(entries.held_out)
     if cfg.data.dataset:
         require_unseen(Path(cfg.data.dataset), [*entries.validation, *entries.held_out])
-
-    if not cfg.data.dataset:
+    else:
         draw_samples(cfg, [entry.folder for entry in train], samples, out / SAMPLES)
     if met_by is not None:
         loaded, count = [entry.load() for entry in train], cfg.data.met_samples
@@ -149,12 +148,11 @@ def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) 
 
 
 def require_unseen(dataset: Path, entries: list[Entry]) -> None:
-    """Check that a data set of another run holds none of the objects that this one validates and evaluates on.
+    """Check that a whole data set of another run holds none of the objects that this one validates and evaluates on.
 
     Raises:
-        UserError: it does, or is none.
+        UserError: it does.
     """
-    load_samples(dataset)
     # Earlier versions kept folders in place of ids with digests.
     drawn = {Path(item).name if isinstance(item, str) else item[0] for item in recipe_of(dataset)["objects"]}
     seen = sorted(entry.id for entry in entries if entry.id in drawn)

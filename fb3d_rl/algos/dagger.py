@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torchrl.objectives import BCLoss
 
 from fb3d_rl.algos import setup
-from fb3d_rl.algos.artflownet import load_network
+from fb3d_rl.algos.artflownet import CHECKPOINT, load_network, state_before
 from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, expert_share, relabelled
 from fb3d_rl.contract import Key, UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
@@ -51,7 +51,6 @@ from fb3d_rl.training.schedules import beta
 if TYPE_CHECKING:
     from fb3d_rl.config import EvaluateConfig, ImitationConfig, TrainConfig
 
-CHECKPOINT = "checkpoint.pt"
 BUFFER = "buffer"
 ALGOS = ("bc", "dagger")
 # TorchRL 0.14.1 says so of its own BCLoss, in which it left out two annotations.
@@ -128,9 +127,7 @@ class Run:
         self.protocol = setup.protocol(cfg, cfg.resume)
         setup.require_simulator()
         self.limits = setup.velocity_limits(cfg)
-        # A run that was killed before its first checkpoint has lost nothing: it starts anew.
-        begun = (out / "config.yaml").is_file() and not (out / CHECKPOINT).exists()
-        saved = load_checkpoint(out / CHECKPOINT, algo=algo.name) if cfg.resume and not begun else None
+        saved = state_before(cfg, out)
         self.resumed = saved is not None
         given = DemonstrationBuffer.open(algo.demonstrations) if algo.demonstrations else None
         self.given = len(given.episodes) if given else 0
