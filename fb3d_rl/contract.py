@@ -7,9 +7,6 @@ N is the number of points of a cloud (1200 unless configured otherwise).
 
 from __future__ import annotations
 
-import errno
-import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -19,49 +16,6 @@ UNTRAINED = ("expert", "random", "normal")
 """Policies that need no checkpoint."""
 ACTION_DIM = 8
 """x y z, roll pitch yaw, two fingers (supplement, II.C)."""
-
-
-class UserError(Exception):
-    """An error that the user caused and can mend; its message is one clear sentence.
-
-    Commands print the message alone and end with exit code 2.
-    """
-
-
-class Interrupted(UserError):
-    """Ctrl-C ended the work; the message says what is kept."""
-
-
-def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
-    """Run a command and turn what the user can mend into one sentence on stderr.
-
-    Args:
-        work: the command; returns its exit code, or None for 0.
-        interrupted: what Ctrl-C leaves behind.
-
-    Returns:
-        The exit code: 2 after an error.
-    """
-    try:
-        return work() or 0
-    except UserError as error:
-        sentence = str(error)
-    except OSError as error:
-        if (found := of_disk(error)) is None:
-            raise
-        sentence = found
-    except KeyboardInterrupt:
-        sentence = f"interrupted; {interrupted}"
-    print(f"error: {sentence}", file=sys.stderr)
-    return 2
-
-
-def of_disk(error: OSError) -> str | None:
-    """What the disk or a file is at fault of; None if it is not."""
-    if error.filename is not None:
-        return f"{error.filename} cannot be written or read ({error.strerror})"
-    full = (errno.ENOSPC, getattr(errno, "EDQUOT", None))
-    return f"the disk has no room ({error.strerror})" if error.errno in full else None
 
 
 Key = str | tuple[str, ...]

@@ -43,14 +43,28 @@ def run(main: Callable[[], int | None]) -> NoReturn:
     _begun = True
     try:
         code: Any = main()
-    except KeyboardInterrupt:
-        print("error: interrupted", file=sys.stderr)
-        code = CODE
     except SystemExit as end:
         code = end.code
+    except BaseException as error:
+        if not caused(error):
+            raise
+        print("error: interrupted", file=sys.stderr)
+        code = CODE
     if _signal.getsignal(_signal.SIGINT) is _pressed:  # what is done at exit would print an exception
         _signal.signal(_signal.SIGINT, lambda *_: os._exit(code if isinstance(code, int) else int(code is not None)))
     sys.exit(code)
+
+
+def caused(error: BaseException) -> bool:
+    """Whether Ctrl-C is what ``error`` comes from: clean-up that it interrupts may raise another exception."""
+    seen: set[int] = set()
+    cause: BaseException | None = error
+    while cause is not None and id(cause) not in seen:
+        if isinstance(cause, KeyboardInterrupt):
+            return True
+        seen.add(id(cause))
+        cause = cause.__cause__ or cause.__context__
+    return False
 
 
 def _pressed(number: int, frame: FrameType | None) -> None:

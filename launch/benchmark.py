@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, default=Path("results/runs/benchmark.json"), help="JSON file to write")
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import exit_code
+    from fb3d_rl.errors import exit_code
 
     return exit_code(lambda: run(options), interrupted="nothing was written")
 
@@ -50,9 +50,9 @@ def run(options: argparse.Namespace) -> None:
     from rich.table import Table
 
     from fb3d_rl.assets.catalog import find_objects
-    from fb3d_rl.contract import UserError
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
+    from fb3d_rl.errors import UserError
     from fb3d_rl.evaluation import benchmark
     from fb3d_rl.evaluation.network_speed import draw_clouds, install_peer, network_speed
     from fb3d_rl.evaluation.tables import number_rows

@@ -23,8 +23,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from fb3d_rl import interrupt
 from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
-from fb3d_rl.contract import Interrupted, UserError, of_disk
+from fb3d_rl.errors import Interrupted, UserError, of_disk
 
 CONF = str(Path(__file__).resolve().parents[1] / "conf")
 SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig | ViewConfig]] = {
@@ -125,15 +126,15 @@ def _one_sentence(where: str = "") -> Iterator[None]:
         sys.exit(say(str(error)).code)  # the whole sweep
     except UserError as error:
         raise say(str(error)) from error
-    except (HydraException, OmegaConfBaseException) as error:
-        raise say(_sentence(error)) from error
-    except OSError as error:
-        if (sentence := of_disk(error)) is None:
-            raise
-        raise say(f"{sentence}; choose another folder: hydra.run.dir=DIR") from error
-    except KeyboardInterrupt:
-        hint = "a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER"
-        sys.exit(say(f"interrupted; {hint}").code)
+    except (Exception, KeyboardInterrupt) as error:
+        if interrupt.caused(error):
+            hint = "a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER"
+            sys.exit(say(f"interrupted; {hint}").code)
+        if isinstance(error, HydraException | OmegaConfBaseException):
+            raise say(_sentence(error)) from error
+        if isinstance(error, OSError) and (sentence := of_disk(error)) is not None:
+            raise say(f"{sentence}; choose another folder: hydra.run.dir=DIR") from error
+        raise
 
 
 def _sentence(error: BaseException) -> str:

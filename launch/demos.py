@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (2: an error that the user can mend)."""
     options = _parser().parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import exit_code
+    from fb3d_rl.errors import exit_code
 
     return exit_code(
         lambda: COMMANDS[options.command](options), interrupted="episodes that record had finished are kept"
@@ -89,7 +89,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def record(options: argparse.Namespace) -> None:
     """Run the expert and keep its episodes."""
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
 
     for key, least in (("objects", 1), ("trials", 1), ("points", 64), ("horizon", 1), ("workers", 1), ("seed", 0)):
         value = getattr(options, key)
@@ -155,8 +155,8 @@ def show_list(options: argparse.Namespace) -> None:
 
 def show(options: argparse.Namespace) -> None:
     """Draw an episode."""
-    from fb3d_rl.contract import UserError
     from fb3d_rl.data.demonstrations import DemonstrationBuffer
+    from fb3d_rl.errors import UserError
 
     if options.out.suffix not in (".png", ".gif", ".mp4"):
         raise UserError(f"--out {options.out} is no picture or film; choose a name that ends in .png, .gif or .mp4")
@@ -234,7 +234,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
 
 
 def _episode(buffer: DemonstrationBuffer, episode: int) -> int:
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
 
     if not 0 <= episode < len(buffer.episodes):
         raise UserError(f"{buffer.path} has {len(buffer.episodes)} episodes, the first is 0; there is no {episode}")

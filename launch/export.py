@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--points", type=int, default=1200, help="points of a cloud, for .pt2 (default: 1200)")
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import exit_code
+    from fb3d_rl.errors import exit_code
 
     return exit_code(lambda: run(options), interrupted="nothing was written")
 
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> None:
     """Read and write."""
     from fb3d_rl.algos.artflownet import load_network
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
     from fb3d_rl.models.export import export
     from fb3d_rl.training.checkpoint import load_checkpoint
 

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (1: validate found an object that is broken; 2: a mistake)."""
     options = _parser().parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import exit_code
+    from fb3d_rl.errors import exit_code
 
     return exit_code(lambda: COMMANDS[options.command](options), interrupted="objects that were finished are kept")
 
@@ -133,7 +133,7 @@ def preview(options: argparse.Namespace) -> None:
     from rich.progress import track
 
     from fb3d_rl.assets.catalog import partnet_catalog
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
     from fb3d_rl.evaluation import preview
 
     if options.out.suffix not in (".png", ".html"):
@@ -162,7 +162,7 @@ def validate(options: argparse.Namespace) -> int:
 
     from fb3d_rl.assets.folders import find_folders
     from fb3d_rl.children import withheld, worker_pool
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
     from fb3d_rl.files import write_text
     from fb3d_rl.flow.validation import examine
 

@@ -43,14 +43,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     # Imported late: --help answers at once.
-    from fb3d_rl.contract import exit_code
+    from fb3d_rl.errors import exit_code
 
     return exit_code(lambda: run(options), interrupted="nothing was written")
 
 
 def run(options: argparse.Namespace) -> None:
     """Read the runs, print and write."""
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
     from fb3d_rl.evaluation import comparison, comparison_page, published, report, runs, tables
     from fb3d_rl.files import write_text
 

@@ -15,7 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from fb3d_rl.config import RUN_FILES, changes_no_number
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.settings import leaves
 
 CONFIG = "config.yaml"

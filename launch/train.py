@@ -19,7 +19,7 @@ from command import main
 def task(cfg: Any, out: Path) -> None:
     """Run the configured algorithm; its imports take seconds, so they come after the configuration's checks."""
     from fb3d_rl.algos import artflownet, dagger
-    from fb3d_rl.contract import UserError
+    from fb3d_rl.errors import UserError
     from fb3d_rl.training.processes import joined, started
 
     if cfg.algo.name != "artflownet" and started() > 1:

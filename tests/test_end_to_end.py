@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate as evaluation
 from fb3d_rl.evaluation.rows import read_trials, write_trials
 from fb3d_rl.training.run_log import RunLog, read_rows

@@ -61,6 +61,26 @@ MISTAKE = """
 atexit.register(press)
 interrupt.run(lambda: sys.exit("no"))
 """
+CLEAN_UP_FAILS = """
+def main():
+    try:
+        press()
+        time.sleep(9)
+    finally:
+        None.missing
+"""
+EXIT_CODE = """
+from fb3d_rl.errors import exit_code
+interrupt.run(lambda: exit_code(main, "all is kept"))
+"""
+LAUNCHED = f"""
+sys.path.insert(0, {str(ROOT / "launch")!r})
+import command
+def launched():
+    with command._one_sentence():
+        main()
+interrupt.run(launched)
+"""
 IGNORED = """
 import signal
 signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -75,6 +95,10 @@ PROGRAMS = {
     "after everything": ("import atexit, os, signal\natexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))\n"
                          + BEGIN + "interrupt.run(lambda: 3)", 3, ""),
     "after a mistake": (BEGIN + MISTAKE, 1, None),
+    "where clean-up fails": (BEGIN + CLEAN_UP_FAILS + "interrupt.run(main)", 2, "error: interrupted\n"),
+    "where a command's clean-up fails": (BEGIN + CLEAN_UP_FAILS + EXIT_CODE, 2, "error: interrupted; all is kept\n"),
+    "where clean-up fails under Hydra": (BEGIN + CLEAN_UP_FAILS + LAUNCHED, 2, "error: interrupted; a folder with a "
+                                         "checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER\n"),
     "where it is ignored": (IGNORED + BEGIN + "interrupt.run(press)", 0, ""),
 }  # fmt: skip
 

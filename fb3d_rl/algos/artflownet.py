@@ -20,9 +20,9 @@ from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import meet_samples
 from fb3d_rl.algos.kinds import KINDS
 from fb3d_rl.assets.catalog import Entry
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
 from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.flow import held_out_samples
 from fb3d_rl.evaluation.rows import TrialRow

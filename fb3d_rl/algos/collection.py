@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from tensordict import TensorDictBase
 
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.workers import Workers
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import demonstrations
 from fb3d_rl.evaluation.demonstrations import episode_info
 from fb3d_rl.evaluation.trials import BARREN, draw_trials

@@ -26,11 +26,12 @@ from torchrl.objectives import BCLoss
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.artflownet import CHECKPOINT, load_network, state_before
 from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, expert_share, relabelled
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.workers import Workers, steady_floats
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.rollout import create_env, run_trials, state_of
 from fb3d_rl.evaluation.rows import TrialRow

@@ -25,11 +25,11 @@ from fb3d_rl.assets.catalog import (
 from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.env.workers import CollectorOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.evaluation.report import LOST_GEOMETRY
 from fb3d_rl.evaluation.rollout import limits_of

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from lzma import LZMAError
 from pathlib import Path
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 BROKEN = (
     zipfile.BadZipFile, tarfile.TarError, zlib.error, LZMAError, struct.error,

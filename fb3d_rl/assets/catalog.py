@@ -15,7 +15,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders, find_split_file
 from fb3d_rl.assets.partnet_mobility import listed, load_object, load_objects, load_usable, read_category
 from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 URDFS = ("mobility_cvx.urdf", "mobility_fixed.urdf", "mobility.urdf")
 """An object's URDF, the first that is there: ManiSkill's order, since it made the former two to simulate well."""

@@ -1,7 +1,7 @@
 """Read PartNet-Mobility folders: ``mobility.urdf``, ``semantics.txt``, ``meta.json`` and ``textured_objs/*.obj``.
 
 The objects come from strangers, so nothing in them is trusted: XML entities are refused, mesh paths may not leave
-the folder, sizes are bounded, and every flaw ends in one clear sentence (:class:`fb3d_rl.contract.UserError`).
+the folder, sizes are bounded, and every flaw ends in one clear sentence (:class:`fb3d_rl.errors.UserError`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Lin
 from fb3d_rl.assets.cache import Parsed, cached, digest_of
 from fb3d_rl.assets.folders import URDFS, find_urdf
 from fb3d_rl.assets.splits import CATEGORIES
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element

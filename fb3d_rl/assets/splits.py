@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 SPLITS = ("train_train", "train_test", "test")
 UMPNET_SPLIT = Path(__file__).with_name("umpnet_split.json")

@@ -7,7 +7,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 try:
     from embreex.mesh_construction import TriangleMesh

@@ -22,7 +22,7 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import pixel_points, pixel_rays
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 SENSOR = "depth"
 """Name of the camera among a task's sensors."""

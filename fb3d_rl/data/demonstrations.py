@@ -26,8 +26,9 @@ from torchrl.data import LazyMemmapStorage, RoundRobinWriter, TensorDictReplayBu
 
 from fb3d_rl import contract
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
 from fb3d_rl.data.picking import Index, pick
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl demonstrations 1"

@@ -18,9 +18,9 @@ from tensordict import TensorDict, TensorDictBase
 from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import content_of, load_object
 from fb3d_rl.children import withheld, worker_pool
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
 
 if TYPE_CHECKING:  # takes seconds, which every worker process would wait

@@ -31,8 +31,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, new_buffer, stranger
+from fb3d_rl.errors import UserError
 
 VERSION = "v3.0"
 ABOUT = "meta/fb3d_rl.json"

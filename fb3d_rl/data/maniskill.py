@@ -23,8 +23,8 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, new_buffer, stranger
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import replacing, write_text
 
 OWN = "fb3d_rl"

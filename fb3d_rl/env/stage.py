@@ -23,9 +23,9 @@ from sapien.physx import (
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Mesh
 from fb3d_rl.assets.gripper import gripper_meshes
 from fb3d_rl.camera.raycast import RaycastCamera
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.suction import Suction
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import box_bounds, box_corners, openable_links, opening_range, standing_pose
 

@@ -18,8 +18,8 @@ from torchrl.envs import EnvBase
 
 from fb3d_rl import contract
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial
+from fb3d_rl.errors import UserError
 
 if TYPE_CHECKING:
     import gymnasium

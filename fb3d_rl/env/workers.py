@@ -30,8 +30,9 @@ from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
 from fb3d_rl.env.options import Trial
+from fb3d_rl.errors import UserError
 
 log = logging.getLogger(__name__)
 

@@ -148,8 +148,8 @@ def _expert(options: EnvOptions) -> FlowPolicy:
 
 def _stock_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> tuple[Any, str]:
     """The same task observed by ManiSkill's point cloud, or None and why it cannot run here."""
-    from fb3d_rl.contract import UserError
     from fb3d_rl.env.stock import StockCloudEnv
+    from fb3d_rl.errors import UserError
 
     try:
         return StockCloudEnv(objects, options), ""

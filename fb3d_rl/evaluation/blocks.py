@@ -9,7 +9,7 @@ from typing import Any
 
 import plotly.graph_objects as go
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import page, tables
 from fb3d_rl.evaluation.page import text
 from fb3d_rl.files import write_text

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import plotly.graph_objects as go
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import comparison, curves, failures, page, tables
 from fb3d_rl.evaluation.blocks import COPIED, FACTS, bars, broken, effort, terms, write
 from fb3d_rl.evaluation.comparison import Comparison, Group

@@ -18,11 +18,12 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import partnet_catalog, procedural_catalog
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
-from fb3d_rl.contract import Key, UserError, spec
+from fb3d_rl.contract import Key, spec
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.film import Film, record
 from fb3d_rl.evaluation.rollout import create_env, limits_of, state_of
 from fb3d_rl.evaluation.trials import Scheduled, schedule

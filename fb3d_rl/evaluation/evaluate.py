@@ -19,10 +19,10 @@ from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import lost_geometry
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.workers import CollectorOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
 from fb3d_rl.evaluation.picture import write_picture
 from fb3d_rl.evaluation.report import LOST_GEOMETRY, write_report

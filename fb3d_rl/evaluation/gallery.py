@@ -10,7 +10,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import page
 from fb3d_rl.evaluation.failures import end, in_order
 from fb3d_rl.evaluation.page import text

@@ -26,8 +26,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.children import withheld
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import BACKBONES
 from fb3d_rl.training.fit import PRECISIONS, flow_loss, tune_cpu

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from fb3d_rl.assets.splits import UMPNET_SPLIT
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, policies
 from fb3d_rl.evaluation.runs import Run

@@ -14,7 +14,7 @@ from dataclasses import MISSING, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
 
 # Why a part was not opened.

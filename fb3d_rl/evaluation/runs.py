@@ -17,7 +17,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_flow, read_trials
 from fb3d_rl.settings import leaves

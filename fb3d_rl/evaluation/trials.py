@@ -14,9 +14,9 @@ import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.cache import content_digest
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Start, Trial, default_trial, drawn_fraction
+from fb3d_rl.errors import UserError
 from fb3d_rl.perception.cloud import MIN_VISIBLE
 
 

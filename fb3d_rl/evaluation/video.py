@@ -20,8 +20,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.shade import GRIPPER, TARGET, Body, Camera, Color, Part, Placed, Studio, link_colors, srgb
 from fb3d_rl.camera.views import View, look_at
 from fb3d_rl.children import withheld
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.film import Film, record
 from fb3d_rl.evaluation.rows import TrialRow, film_name
 from fb3d_rl.evaluation.tables import own_policy

@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import openable_links, opening_range
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.cloud_network import CloudNetwork
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])

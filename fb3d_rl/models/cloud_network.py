@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_bytes
 from fb3d_rl.models.delayed import DelayedPointNet2
 from fb3d_rl.models.dense import initialize

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_bytes
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.delayed import DelayedPointNet2, PooledAbstraction

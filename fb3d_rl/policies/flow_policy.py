@@ -18,7 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequ
 from torch import Tensor, nn
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.rigid_motion import local_weight, rigid_motion
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate

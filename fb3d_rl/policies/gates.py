@@ -14,7 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
+from fb3d_rl.errors import UserError
 from fb3d_rl.policies.interaction import BetaGate, Gate, HumanGate
 
 EXPERT: Key = ("expert", "action")

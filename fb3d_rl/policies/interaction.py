@@ -10,7 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
+from fb3d_rl.errors import UserError
 from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowPolicy
 
 

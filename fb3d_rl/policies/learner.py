@@ -17,7 +17,8 @@ from tensordict.nn import (
 from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
-from fb3d_rl.contract import Key, UserError
+from fb3d_rl.contract import Key
+from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import replacing
 
 FORMAT = "fb3d_rl checkpoint 1"

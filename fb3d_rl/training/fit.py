@@ -28,7 +28,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 from torch.optim.swa_utils import get_ema_multi_avg_fn as ema_of
 
-from fb3d_rl.contract import Interrupted, UserError
+from fb3d_rl.errors import Interrupted, UserError
 from fb3d_rl.training.processes import rank_and_count
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
 
 if TYPE_CHECKING:

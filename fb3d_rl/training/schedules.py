@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 SCHEDULES = ("constant", "linear", "exponential", "first")
 

@@ -24,8 +24,8 @@ from fb3d_rl.algos.artflownet import (
     training_rows,
 )
 from fb3d_rl.config import TRAINED, UNTRAINED
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.generate import load_samples
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint

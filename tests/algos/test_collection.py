@@ -16,10 +16,11 @@ from fb3d_rl.algos import collection
 from fb3d_rl.algos.collection import RowsOptions, collect
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.contract import F32, GROUPS, UserError
+from fb3d_rl.contract import F32, GROUPS
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Trial
 from fb3d_rl.env.workers import Episode, Workers
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.trials import BARREN
 from fb3d_rl.policies.hand import VelocityLimits
 

@@ -18,8 +18,8 @@ from fb3d_rl.algos.screwnet import screw_loss, screw_objective
 from fb3d_rl.algos.ump_di import direction_cosine
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.flow.joint_screw import screw_of_flow
 from fb3d_rl.models.cloud_network import CloudNetwork

@@ -15,7 +15,7 @@ from fb3d_rl.algos.artflownet import run_evaluation
 from fb3d_rl.algos.setup import env_options, eval_entries, flow_policy_options, one_object, settled, train_entries
 from fb3d_rl.assets.partnet_mobility import read_category
 from fb3d_rl.config import AssetsConfig
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from fb3d_rl.assets import archive as module
 from fb3d_rl.assets.archive import unpack
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 NAMES = ("../out.txt", "a/../../out.txt", "..\\out.txt", "good/1/mobility.urdf")
 

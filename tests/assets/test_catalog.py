@@ -13,7 +13,7 @@ from fb3d_rl.assets.catalog import folder_entries, lost_geometry, partnet_catalo
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import FAMILIES
 from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -17,7 +17,7 @@ from fb3d_rl.assets import partnet_mobility
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders
 from fb3d_rl.assets.partnet_mobility import load_object, load_objects
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 2 3\nf 1 3 4\n"
 SHAPE = """<{tag}><origin xyz="0.5 -1 2" rpy="0.3 -0.7 1.9"/>

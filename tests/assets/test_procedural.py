@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import FAMILIES, generate, object_id, sample
 from fb3d_rl.assets.procedural.spec import write_object
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
 from fb3d_rl.flow.kinematics import KinematicTree
 

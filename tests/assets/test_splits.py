@@ -18,7 +18,7 @@ from fb3d_rl.assets.splits import (
     split_of,
     validation_ids,
 )
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 CATEGORIES = {"1": "Laptop", "2": "Laptop", "3": "Oven", "4": "Table", "x-5": "Laptop"}
 TABLE = {"1": "train_train", "2": "train_test", "3": "test", "99": "test"}

@@ -22,7 +22,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.flow.opening import opening_range, standing_pose
 

@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.demonstrations import TABLE, DemonstrationBuffer, EpisodeInfo
+from fb3d_rl.errors import UserError
 
 INFO = EpisodeInfo(
     object="é/1", category="Oven", link=2, start=(0.1, -0.2), view=View(12.5, 1 / 3), seed=2**40, round=1,

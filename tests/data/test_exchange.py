@@ -14,9 +14,10 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError, spec
+from fb3d_rl.contract import spec
 from fb3d_rl.data import lerobot, maniskill
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
+from fb3d_rl.errors import UserError
 
 POINTS = 6
 INFO = EpisodeInfo("a/1", "Oven", 2, (0.1, -0.2), View(12.5, 1 / 3), 2**40, 1, True, 0.05, 9)

@@ -14,9 +14,9 @@ from tensordict import TensorDictBase
 from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.generate import DONE, generate_samples, load_samples
 from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.errors import UserError
 
 OPTIONS = SampleOptions(points=256, camera=CameraOptions(resolution=32))
 COUNT = 11

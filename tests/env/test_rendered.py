@@ -11,9 +11,9 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.sapien import require_renderer
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
+from fb3d_rl.errors import UserError
 
 from .conftest import links_called, velocity
 

@@ -17,9 +17,9 @@ from tensordict import TensorDict
 from fb3d_rl import contract
 from fb3d_rl.assets.articulation import ArticulatedObject, Link, Mesh
 from fb3d_rl.camera.views import View, ViewRange
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
+from fb3d_rl.errors import UserError
 from fb3d_rl.flow.opening import openable_links
 
 from .conftest import POINTS, links_called, place_before, start, step_until, velocity

@@ -18,10 +18,10 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.collectors.distributed import RayCollector
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.contract import UserError
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers, steady_floats
+from fb3d_rl.errors import UserError
 
 HORIZON = 6
 OPTIONS = EnvOptions(points=64, horizon=HORIZON)

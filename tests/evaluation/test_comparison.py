@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import learning, tables
 from fb3d_rl.evaluation.comparison import COLUMNS, Comparison, Entry, compare
 from fb3d_rl.evaluation.comparison_page import write_comparison

@@ -12,12 +12,13 @@ import torch
 from tensordict import TensorDictBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.contract import UserError, check
+from fb3d_rl.contract import check
 from fb3d_rl.data import maniskill
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.workers import CollectorOptions, Episode, Workers
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.demonstrations import (
     KEYS,
     Assets,

@@ -20,9 +20,9 @@ import torch
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.live import page as pages
 from fb3d_rl.evaluation.live.page import Page, serve
 from fb3d_rl.evaluation.live.server import HOST, start_server

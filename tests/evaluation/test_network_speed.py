@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.contract import UserError, check
+from fb3d_rl.contract import check
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import network_speed
 from fb3d_rl.evaluation.network_speed import draw_clouds, install_peer
 from fb3d_rl.models.cloud_network import BACKBONES

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.published import PUBLISHED, SLIPS, paper
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
 from fb3d_rl.evaluation.runs import read_run

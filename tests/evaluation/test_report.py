@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import gallery
 from fb3d_rl.evaluation.comparison import compare
 from fb3d_rl.evaluation.comparison_page import write_comparison

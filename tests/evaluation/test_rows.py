@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_flow, read_trials, write_flow, write_trials
 
 

@@ -20,9 +20,9 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import video
 from fb3d_rl.evaluation.film import Film, record
 from fb3d_rl.evaluation.rollout import run_trials

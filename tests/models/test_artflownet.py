@@ -9,7 +9,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, artflownet_module
 from fb3d_rl.models.cloud_network import BACKBONES
 

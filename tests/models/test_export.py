@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import BACKBONES
 from fb3d_rl.models.export import DenseArtFlowNet, export

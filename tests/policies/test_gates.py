@@ -12,7 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from fb3d_rl.contract import ACTION_DIM, UserError
+from fb3d_rl.contract import ACTION_DIM
+from fb3d_rl.errors import UserError
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.gates import (
     BUDGETED,

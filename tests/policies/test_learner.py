@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.objectives import BCLoss
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.encoders import ENCODERS

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.algos.dagger import acting_policy
 from fb3d_rl.algos.kinds import KINDS
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.rollout import mask_of
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
 
 

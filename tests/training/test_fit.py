@@ -16,8 +16,8 @@ from torchrl.data import LazyMemmapStorage, ReplayBuffer
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.training.fit import (
     FitOptions,

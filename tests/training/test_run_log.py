@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.training.run_log import RunLog, open_logger, read_rows
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.training.schedules import SCHEDULES, beta
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
 from fb3d_rl.assets.splits import TRAIN_CATEGORIES
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 
 __all__ = ["FAMILIES", "ObjectSpec", "Part", "expand", "generate", "object_id", "sample"]
 

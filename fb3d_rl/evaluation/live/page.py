@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.camera.shade import GRIPPER, Color, link_colors, srgb
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.contract import UserError
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.live.server import HOST, start_server
 from fb3d_rl.evaluation.live.session import Moment, Session
 from fb3d_rl.evaluation.video import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh

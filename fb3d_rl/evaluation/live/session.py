@@ -21,10 +21,10 @@ from torchrl.envs.utils import step_mdp
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.gripper import TIP
 from fb3d_rl.camera.views import View
-from fb3d_rl.contract import UserError
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
+from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.evaluation.rollout import limits_of, policy_env
 from fb3d_rl.evaluation.trials import schedule
