@@ -288,7 +288,7 @@ class FlowConfig:
 
 @dataclass
 class ContactConfig:
-    """fb3d_rl.perception.contact.ContactOptions."""
+    """fb3d_rl.policies.contact.ContactOptions."""
 
     neighbors: int
     curvature: float
@@ -327,7 +327,7 @@ class PolicyConfig:
 
 @dataclass
 class CollectorConfig:
-    """fb3d_rl.env.workers.CollectorOptions.
+    """fb3d_rl.rollout.collectors.CollectorOptions.
 
     Attributes:
         workers: null for one per core.
@@ -345,7 +345,7 @@ class EvaluationConfig:
     Attributes:
         trials: at most this many, spread over the categories; null for all visible openable parts; 0 for none, which
             needs no simulator.
-        start: as goal and repeats of fb3d_rl.evaluation.trials.ScheduleOptions; conf/protocol/ sets the three.
+        start: as goal and repeats of fb3d_rl.rollout.trials.ScheduleOptions; conf/protocol/ sets the three.
         decision_seconds: a trial whose policy takes longer for one decision ends there; null for no limit.
         expert: also run the expert on the same trials.
         clouds: clouds shown in the report.

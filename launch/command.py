@@ -103,6 +103,16 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
         sys.exit(2)
 
 
+def report(out: Path) -> None:
+    """Write the report of a finished run, and say where its results are."""
+    from fb3d_rl.report.run_page import write_report
+
+    path = write_report(out)
+    print(f"results: {out}\nreport:  {path}")
+    if (videos := out / "videos").is_dir():
+        print(f"videos:  {videos}")
+
+
 class _Failed(SystemExit):
     """Ends the process, or this job of a sweep, once it has been said what is wrong."""
 

@@ -102,8 +102,8 @@ def record(options: argparse.Namespace) -> None:
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
     from fb3d_rl.env.torchrl_env import require_simulator
-    from fb3d_rl.env.workers import CollectorOptions, Episode
-    from fb3d_rl.evaluation.demonstrations import Assets, plan, recipe, record_expert
+    from fb3d_rl.rollout.collectors import CollectorOptions, Episode
+    from fb3d_rl.rollout.demonstrations import Assets, plan, recipe, record_expert
     from fb3d_rl.training.checkpoint import git_revision
 
     require_simulator()
@@ -162,9 +162,10 @@ def show(options: argparse.Namespace) -> None:
         raise UserError(f"--out {options.out} is no picture or film; choose a name that ends in .png, .gif or .mp4")
     buffer = DemonstrationBuffer.open(options.demos)
     episode = _episode(buffer, options.episode)
+    from fb3d_rl.drawing.video import require_encoder
     from fb3d_rl.env.torchrl_env import require_simulator
-    from fb3d_rl.evaluation.demonstrations import recorded_object, replay, trial_of
-    from fb3d_rl.evaluation.video import require_encoder, write_filmstrip, write_video
+    from fb3d_rl.rollout.demonstrations import recorded_object, replay, trial_of
+    from fb3d_rl.rollout.videos import write_filmstrip, write_video
 
     trial_of(buffer.episodes[episode])
     require_simulator()

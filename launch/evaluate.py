@@ -10,7 +10,7 @@ if __name__ == "__main__":
 from pathlib import Path
 from typing import Any
 
-from command import main
+from command import main, report
 
 
 def task(cfg: Any, out: Path) -> None:
@@ -18,6 +18,7 @@ def task(cfg: Any, out: Path) -> None:
     from fb3d_rl.algos import artflownet, dagger
 
     (dagger if cfg.policy.name in dagger.ALGOS else artflownet).run_evaluation(cfg, out)
+    report(out)
 
 
 if __name__ == "__main__":

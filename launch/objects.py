@@ -109,7 +109,7 @@ def listing(options: argparse.Namespace) -> None:
     from rich.table import Table
 
     from fb3d_rl.assets.catalog import partnet_catalog
-    from fb3d_rl.flow.opening import openable_links
+    from fb3d_rl.kinematics.opening import openable_links
 
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("object", "category", "split", "joints", "parts that open"):
@@ -134,7 +134,7 @@ def preview(options: argparse.Namespace) -> None:
 
     from fb3d_rl.assets.catalog import partnet_catalog
     from fb3d_rl.errors import UserError
-    from fb3d_rl.evaluation import preview
+    from fb3d_rl.report import preview
 
     if options.out.suffix not in (".png", ".html"):
         raise UserError(f"--out {options.out} is neither a .png nor a .html file; give one of them")
@@ -164,7 +164,7 @@ def validate(options: argparse.Namespace) -> int:
     from fb3d_rl.children import withheld, worker_pool
     from fb3d_rl.errors import UserError
     from fb3d_rl.files import write_text
-    from fb3d_rl.flow.validation import examine
+    from fb3d_rl.kinematics.validation import examine
 
     if options.workers < 1:
         raise UserError(f"--workers {options.workers} is too small; give 1 or more")

@@ -51,8 +51,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> None:
     """Read the runs, print and write."""
     from fb3d_rl.errors import UserError
-    from fb3d_rl.evaluation import comparison, comparison_page, published, report, runs, tables
+    from fb3d_rl.evaluation import comparison, published, runs, tables
     from fb3d_rl.files import write_text
+    from fb3d_rl.report import comparison_page
+    from fb3d_rl.report import run_page as report
 
     folders: list[Path] = options.runs
     if options.paper:

@@ -18,8 +18,8 @@ def task(cfg: Any, out: Path) -> None:
     """Serve the page until Ctrl-C; the imports take seconds, so they come after the configuration's checks."""
     from fb3d_rl.algos import setup
     from fb3d_rl.algos.artflownet import load_network
-    from fb3d_rl.evaluation.live.page import require_viser, serve
-    from fb3d_rl.evaluation.live.session import Session
+    from fb3d_rl.live.page import require_viser, serve
+    from fb3d_rl.live.session import Session
 
     require_viser()
     device = setup.choose_device(cfg.device)

@@ -117,6 +117,15 @@ def procedural_objects(procedural_root: Path) -> dict[str, ArticulatedObject]:
 
 
 @pytest.fixture(scope="session")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ArticulatedObject]:
+    """Procedural objects by category: a cabinet with a door and drawers, a table with drawers, an oven, a laptop."""
+    root = tmp_path_factory.mktemp("objects")
+    categories = ["StorageFurniture", "Table", "Oven", "Laptop"]
+    loaded = [load_object(root / name) for name in generate(root, categories, 1, seed=0)]
+    return {obj.category: obj for obj in loaded}
+
+
+@pytest.fixture(scope="session")
 def real_root() -> Path:
     """Folder of PartNet-Mobility objects."""
     root = os.environ.get("FB3D_PARTNET_MOBILITY")

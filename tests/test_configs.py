@@ -34,10 +34,10 @@ from fb3d_rl.config import (
 )  # fmt: skip
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions
-from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.contact import ContactOptions
+from fb3d_rl.policies.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
+from fb3d_rl.rollout.collectors import CollectorOptions
 
 ROOT = Path(__file__).resolve().parents[1]
 CONF = ROOT / "conf"

@@ -11,7 +11,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from fb3d_rl.evaluation.picture import write_picture
+from fb3d_rl.drawing.picture import write_picture
 from fb3d_rl.files import replacing, write_text
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.export import export

@@ -22,11 +22,11 @@ from fb3d_rl.assets.cache import content_digest
 from fb3d_rl.contract import Key
 from fb3d_rl.data.generate import empty_rows, finish, finished_rows
 from fb3d_rl.data.samples import ObjectView
-from fb3d_rl.env.workers import Workers
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
-from fb3d_rl.evaluation.rollout import create_env, state_of
-from fb3d_rl.evaluation.trials import BARREN, draw_trials
+from fb3d_rl.rollout.collectors import Workers
+from fb3d_rl.rollout.run import create_env, state_of
+from fb3d_rl.rollout.trials import BARREN, draw_trials
 
 EVERY = 0.2
 """Time (s) from one frame that is kept to the next: sooner they are nearly alike."""

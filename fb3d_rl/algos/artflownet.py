@@ -25,13 +25,13 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.evaluation.flow import held_out_samples
-from fb3d_rl.evaluation.rows import TrialRow
 from fb3d_rl.flow.metrics import mean_metrics
-from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
+from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, git_revision, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, check_state, emulates_bf16, fit, require_compiler

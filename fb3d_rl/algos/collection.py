@@ -14,13 +14,13 @@ from tensordict import TensorDictBase
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import ObjectView, SampleOptions
-from fb3d_rl.env.workers import Workers
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation import demonstrations
-from fb3d_rl.evaluation.demonstrations import episode_info
-from fb3d_rl.evaluation.trials import BARREN, draw_trials
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
+from fb3d_rl.rollout import demonstrations
+from fb3d_rl.rollout.collectors import Workers
+from fb3d_rl.rollout.demonstrations import episode_info
+from fb3d_rl.rollout.trials import BARREN, draw_trials
 
 STEPS_OF_TRIAL = 60
 """Labels that a trial is reckoned to bring."""

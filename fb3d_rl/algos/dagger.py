@@ -30,12 +30,8 @@ from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import ObjectView
-from fb3d_rl.env.workers import Workers, steady_floats
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
-from fb3d_rl.evaluation.rollout import create_env, run_trials, state_of
-from fb3d_rl.evaluation.rows import TrialRow
-from fb3d_rl.evaluation.trials import schedule
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
@@ -43,6 +39,10 @@ from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
+from fb3d_rl.rollout.collectors import Workers, steady_floats
+from fb3d_rl.rollout.rows import TrialRow
+from fb3d_rl.rollout.run import create_env, run_trials, state_of
+from fb3d_rl.rollout.trials import schedule
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, Objective, check_state, fit, generator

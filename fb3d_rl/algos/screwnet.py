@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fb3d_rl.flow.joint_screw import JointScrew, screw_of_flow
+from fb3d_rl.kinematics.joint_screw import JointScrew, screw_of_flow
 from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.training.fit import FitOptions, Objective, augment, products_of
 

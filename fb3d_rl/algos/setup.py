@@ -15,6 +15,7 @@ import torch
 from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import (
+    LOST_GEOMETRY,
     Entry,
     entry_of,
     folder_entries,
@@ -26,18 +27,17 @@ from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.drawing.video import require_encoder
 from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOptions
 from fb3d_rl.env.torchrl_env import require_simulator
-from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
-from fb3d_rl.evaluation.report import LOST_GEOMETRY
-from fb3d_rl.evaluation.rollout import limits_of
-from fb3d_rl.evaluation.trials import ScheduleOptions
-from fb3d_rl.evaluation.video import require_encoder
-from fb3d_rl.perception.contact import ContactOptions
+from fb3d_rl.policies.contact import ContactOptions
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.rollout.collectors import CollectorOptions
+from fb3d_rl.rollout.run import limits_of
+from fb3d_rl.rollout.trials import ScheduleOptions
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:

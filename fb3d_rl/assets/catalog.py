@@ -49,6 +49,10 @@ class Entry:
         return obj
 
 
+LOST_GEOMETRY = "lost_geometry"
+"""Key of a summary: what the run's objects lost in reading, by their ids."""
+
+
 def lost_geometry(objects: Iterable[ArticulatedObject]) -> dict[str, list[str]]:
     """What of the objects' files is no part of them, by the ids of those that lost some of their geometry."""
     return {obj.id: list(obj.lost) for obj in objects if obj.lost}

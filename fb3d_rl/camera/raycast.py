@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.embree import EmbreeScene, triangle_scene
 from fb3d_rl.camera.views import View, look_at, pixel_points, pixel_rays
-from fb3d_rl.flow.opening import standing_bounds
+from fb3d_rl.kinematics.opening import standing_bounds
 
 
 @dataclass(frozen=True)

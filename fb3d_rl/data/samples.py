@@ -13,8 +13,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
-from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import openable_links, opening_range, standing_pose
+from fb3d_rl.kinematics.opening import openable_links, opening_range, standing_pose
+from fb3d_rl.kinematics.tree import KinematicTree
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 

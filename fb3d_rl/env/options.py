@@ -13,7 +13,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.opening import openable_links, opening_range, start_fraction
+from fb3d_rl.kinematics.opening import openable_links, opening_range, start_fraction
 
 
 @dataclass(frozen=True)

@@ -26,8 +26,8 @@ from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.suction import Suction
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import box_bounds, box_corners, openable_links, opening_range, standing_pose
+from fb3d_rl.kinematics.opening import box_bounds, box_corners, openable_links, opening_range, standing_pose
+from fb3d_rl.kinematics.tree import KinematicTree
 
 if TYPE_CHECKING:
     from mani_skill.envs.scene import ManiSkillScene

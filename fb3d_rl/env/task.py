@@ -28,15 +28,15 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.assets.gripper import BODIES, FINGERS, TOOL
 from fb3d_rl.camera.sapien import SENSOR, SapienCamera, add_visuals, camera_config, require_renderer
-from fb3d_rl.camera.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
 from fb3d_rl.contract import ACTION_DIM
+from fb3d_rl.drawing.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
 from fb3d_rl.env.gripper import FloatingSuctionGripper
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial, drawn_fraction
 from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage
 from fb3d_rl.env.suction import ContactImpulses, Suction
 from fb3d_rl.errors import UserError
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
-from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
 
 logger.addFilter(lambda record: "does not support rendering" not in record.getMessage())  # it draws without

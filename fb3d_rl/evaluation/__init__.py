@@ -1,1 +1,1 @@
-"""From trials to what people read: rows, tables with intervals, the report."""
+"""From rows to numbers: intervals, tables, comparisons, published numbers beside them."""

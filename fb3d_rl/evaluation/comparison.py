@@ -8,7 +8,7 @@ Definitions
     they are one entry with those of another group if both have trials in common and every one of these ended alike;
     what ended otherwise stands apart under the name of its group.
     Two rows are of the same *trial* if their keys are equal, which tell the object's content, part, start, goal, view
-    and what suction may hold (:func:`fb3d_rl.evaluation.trials.trial_key`). Rows of earlier versions have no key: they
+    and what suction may hold (:func:`fb3d_rl.rollout.trials.trial_key`). Rows of earlier versions have no key: they
     are of the same trial if object, part and seeds are the same and the runs' settings of all that a key tells are.
 
 Intervals
@@ -33,10 +33,10 @@ from rich.console import Console
 from rich.table import Table
 
 from fb3d_rl.evaluation import tables
-from fb3d_rl.evaluation.rows import TrialRow, policies
 from fb3d_rl.evaluation.runs import Run, labels
 from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCESS, TRIAL, Means, Metric
 from fb3d_rl.files import write_text
+from fb3d_rl.rollout.rows import TrialRow, policies
 
 METHOD = (
     ("Interval", "95 %, with an object as the unit: its trials, over all seeds, are no more objects. It tells how the "

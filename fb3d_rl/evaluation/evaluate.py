@@ -18,22 +18,21 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.catalog import lost_geometry
+from fb3d_rl.assets.catalog import LOST_GEOMETRY, lost_geometry
 from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.drawing.picture import write_picture
 from fb3d_rl.env.options import EnvOptions
-from fb3d_rl.env.workers import CollectorOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
-from fb3d_rl.evaluation.picture import write_picture
-from fb3d_rl.evaluation.report import LOST_GEOMETRY, write_report
-from fb3d_rl.evaluation.rollout import run_trials
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
 from fb3d_rl.evaluation.tables import DECISION, show, summary
-from fb3d_rl.evaluation.trials import Scheduled, ScheduleOptions, schedule, trial_key
-from fb3d_rl.evaluation.video import film_trials
 from fb3d_rl.files import replacing, write_text
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.policies.digest import policy_digest
+from fb3d_rl.rollout.collectors import CollectorOptions
+from fb3d_rl.rollout.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
+from fb3d_rl.rollout.run import run_trials
+from fb3d_rl.rollout.trials import Scheduled, ScheduleOptions, schedule, trial_key
+from fb3d_rl.rollout.videos import film_trials
 from fb3d_rl.training.run_log import read_rows
 
 
@@ -81,7 +80,7 @@ def evaluate(
 ) -> list[TrialRow]:
     """Run the trials with every policy, measure the flow network, and write the results below ``out``.
 
-    Writes rows.csv, summary.json and report.html, with ``net`` also flow_rows.csv, flow_rows_all_parts.csv, clouds.npz
+    Writes rows.csv and summary.json, with ``net`` also flow_rows.csv, flow_rows_all_parts.csv, clouds.npz
     and flow.png, with ``protocol.videos`` also videos/, and prints the table.
 
     Args:
@@ -141,10 +140,6 @@ def evaluate(
                 out / "videos", rows, protocol.videos, policies, shown, scheduled, protocol.env,
                 lambda done, total: bar.update(task, completed=done, total=total),
             )  # fmt: skip
-    report = write_report(out)
-    print(f"results: {out}\nreport:  {report}")
-    if rows and protocol.videos:
-        print(f"videos:  {out / 'videos'}")
     return rows
 
 

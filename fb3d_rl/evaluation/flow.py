@@ -14,8 +14,8 @@ from torch import nn
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.rows import FlowRow
 from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.rollout.rows import FlowRow
 
 TARGETS = ("part", "all")
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, read_flow, read_trials
+from fb3d_rl.rollout.rows import FlowRow, TrialRow, read_flow, read_trials
 from fb3d_rl.settings import leaves
 
 CLOUD_ARRAYS = ("points", "valid", "part_mask", "flow_true", "flow_predicted", "title")

@@ -47,7 +47,7 @@ from scipy.special import betaincinv, stdtrit
 from scipy.stats import norm
 
 from fb3d_rl.contract import UNTRAINED
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, policies
+from fb3d_rl.rollout.rows import FlowRow, TrialRow, own_policy, policies
 
 LEVEL = 0.95
 _UPPER = (1 + LEVEL) / 2
@@ -307,12 +307,6 @@ def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | Non
             out |= measured
         out |= {f"{policy}/{key}": value for key, value in measured.items()}
     return out
-
-
-def own_policy(rows: Iterable[TrialRow]) -> str | None:
-    """The policy that a run is about: the first but the expert, else the expert; None without rows."""
-    names = policies(rows)
-    return next((name for name in names if name != "expert"), names[0] if names else None)
 
 
 def summary(

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from fb3d_rl.flow.kinematics import KinematicTree
+from fb3d_rl.kinematics.tree import KinematicTree
 
 STEP = 0.01
 """Displacement of the joint, rad or m."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from fb3d_rl.flow.joint_screw import JointScrew, flow_of_screw
 from fb3d_rl.geometry.transforms import normalize
+from fb3d_rl.kinematics.joint_screw import JointScrew, flow_of_screw
 from fb3d_rl.models.cloud_network import CloudNetwork
 
 

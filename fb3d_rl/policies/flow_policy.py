@@ -19,11 +19,11 @@ from torch import Tensor, nn
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.rigid_motion import local_weight, rigid_motion
 from fb3d_rl.geometry.points import squared_distances
+from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion
 from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
 from fb3d_rl.models.artflownet import artflownet_module, reads_mask
-from fb3d_rl.perception.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
+from fb3d_rl.policies.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
@@ -126,7 +126,7 @@ class Memory:
         tries: how many that were.
         chosen: how many contact points it has set out for.
         candidates: points that would have done as well as the chosen one when it was chosen
-            (:func:`~fb3d_rl.perception.contact.choose_contact`).
+            (:func:`~fb3d_rl.policies.contact.choose_contact`).
     """
 
     phase: int
@@ -322,7 +322,7 @@ class FlowPolicy(TensorDictModuleBase):
         Args:
             state: as of :meth:`initial_state`; written in place.
             obs: the contract's "observation" group.
-            chosen: as :func:`~fb3d_rl.perception.contact.choose_contact` returns it.
+            chosen: as :func:`~fb3d_rl.policies.contact.choose_contact` returns it.
         """
         contact, pull, standoff, candidates = chosen
         state.update({"contact_point": contact, "pull": pull, "standoff": standoff, "candidates": candidates})

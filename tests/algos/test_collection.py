@@ -19,10 +19,10 @@ from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import F32, GROUPS
 from fb3d_rl.data.samples import ObjectView, SampleOptions
 from fb3d_rl.env.options import Trial
-from fb3d_rl.env.workers import Episode, Workers
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.trials import BARREN
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.rollout.collectors import Episode, Workers
+from fb3d_rl.rollout.trials import BARREN
 
 SAMPLES = SampleOptions(points=64, camera=CameraOptions(resolution=24))
 STEPS = 6

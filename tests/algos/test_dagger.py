@@ -20,11 +20,11 @@ from tensordict import TensorDict
 from fb3d_rl.algos import collection
 from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
-from fb3d_rl.env.workers import Episode
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import twist_of
+from fb3d_rl.rollout.collectors import Episode
+from fb3d_rl.rollout.rows import read_trials
 from fb3d_rl.training.checkpoint import load_checkpoint
 from fb3d_rl.training.run_log import read_rows
 

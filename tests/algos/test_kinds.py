@@ -20,12 +20,12 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.rows import read_trials
-from fb3d_rl.flow.joint_screw import screw_of_flow
+from fb3d_rl.kinematics.joint_screw import screw_of_flow
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.rollout.rows import read_trials
 from fb3d_rl.training.fit import FitOptions, fit
 from fb3d_rl.training.run_log import RunLog, read_rows
 
@@ -145,7 +145,7 @@ def test_a_run_in_small_is_resumed_and_evaluated_bit_for_bit(name: str, tmp_path
     summary = json.loads((first / "summary.json").read_text())
     assert ("flow/cosine" in summary) == KINDS[name].flow and "success_rate" in summary
     metrics = read_rows(first / "metrics.jsonl", times=False)
-    assert any("val/cosine" in row for row in metrics) and (first / "report.html").is_file()
+    assert any("val/cosine" in row for row in metrics)
     best = load_trained(first / "best.safetensors", name)
     assert type(best) is KINDS[name].network
 

@@ -21,7 +21,7 @@ from fb3d_rl.assets.procedural import FAMILIES, generate, object_id, sample
 from fb3d_rl.assets.procedural.spec import write_object
 from fb3d_rl.errors import UserError
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
-from fb3d_rl.flow.kinematics import KinematicTree
+from fb3d_rl.kinematics.tree import KinematicTree
 
 PER_FAMILY = 4
 SEED = 3

@@ -16,8 +16,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.camera.embree import triangle_scene
 from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View
-from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import opening_range, standing_pose
+from fb3d_rl.kinematics.opening import opening_range, standing_pose
+from fb3d_rl.kinematics.tree import KinematicTree
 
 OPTIONS = CameraOptions(resolution=33)
 FRONT = View(0.0, 0.0)

@@ -23,8 +23,8 @@ from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.kinematics import KinematicTree
-from fb3d_rl.flow.opening import opening_range, standing_pose
+from fb3d_rl.kinematics.opening import opening_range, standing_pose
+from fb3d_rl.kinematics.tree import KinematicTree
 
 VIEW = View(25.0, 35.0)
 

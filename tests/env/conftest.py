@@ -12,21 +12,11 @@ from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import generate
 from fb3d_rl.env.options import EnvOptions, GripperOptions, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
-from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.kinematics.opening import openable_links
 
 POINTS = 256
-
-
-@pytest.fixture(scope="session")
-def objects(tmp_path_factory: pytest.TempPathFactory) -> dict[str, ArticulatedObject]:
-    """Procedural objects by category: a cabinet with a door and drawers, a table with drawers, an oven, a laptop."""
-    root = tmp_path_factory.mktemp("objects")
-    categories = ["StorageFurniture", "Table", "Oven", "Laptop"]
-    loaded = [load_object(root / name) for name in generate(root, categories, 1, seed=0)]
-    return {obj.category: obj for obj in loaded}
 
 
 @pytest.fixture(scope="session")

@@ -20,7 +20,7 @@ from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.task import OpenArticulatedEnv
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.opening import openable_links
+from fb3d_rl.kinematics.opening import openable_links
 
 from .conftest import POINTS, links_called, place_before, start, step_until, velocity
 

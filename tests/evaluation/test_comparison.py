@@ -20,11 +20,11 @@ from scipy.stats import binomtest
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import learning, tables
 from fb3d_rl.evaluation.comparison import COLUMNS, Comparison, Entry, compare
-from fb3d_rl.evaluation.comparison_page import write_comparison
-from fb3d_rl.evaluation.report import write_report
-from fb3d_rl.evaluation.rows import TrialRow, write_trials
 from fb3d_rl.evaluation.runs import find_runs, read_run
 from fb3d_rl.evaluation.tables import SUCCESS, difference, summary
+from fb3d_rl.report.comparison_page import write_comparison
+from fb3d_rl.report.run_page import write_report
+from fb3d_rl.rollout.rows import TrialRow, write_trials
 from fb3d_rl.training.run_log import RunLog
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from fb3d_rl.evaluation.failures import ENDS, bars, flow_chart, stages
-from fb3d_rl.evaluation.rows import TrialRow
+from fb3d_rl.evaluation.failures import ENDS, stages
+from fb3d_rl.report.failure_charts import bars, flow_chart
+from fb3d_rl.rollout.rows import TrialRow
 
 
 def trial(failure: str = "", contact: bool = True, status: str = "ok") -> TrialRow:

@@ -9,8 +9,8 @@ import pytest
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.published import PUBLISHED, SLIPS, paper
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow, write_flow, write_trials
 from fb3d_rl.evaluation.runs import read_run
+from fb3d_rl.rollout.rows import FlowRow, TrialRow, write_flow, write_trials
 
 
 def flow(category: str, object_: str, cosine: float, rmse: float, split: str = "test") -> FlowRow:

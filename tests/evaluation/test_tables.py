@@ -8,8 +8,8 @@ import pytest
 from rich.console import Console
 from scipy.stats import binomtest
 
-from fb3d_rl.evaluation.rows import FlowRow, TrialRow
 from fb3d_rl.evaluation.tables import UNIT, means, number_rows, show, summary, trainings, wilson
+from fb3d_rl.rollout.rows import FlowRow, TrialRow
 
 
 def trial(category: str, object_: str, success: bool, contact: bool = True, **changes: object) -> TrialRow:

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow, normalize_flow
-from fb3d_rl.flow.kinematics import KinematicTree
 from fb3d_rl.geometry.transforms import apply, inverse
-
-from .chains import pose, random_chain
+from fb3d_rl.kinematics.tree import KinematicTree
+from tests.kinematics.chains import pose, random_chain
 
 # A chord is shorter than its arc by STEP^2 / 24, some 4e-6 of the displacement of at most 0.1 m in these scenes.
 ATOL = 1e-6

@@ -11,9 +11,9 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.algos.artflownet import run_evaluation
-from fb3d_rl.evaluation.rows import read_trials
 from fb3d_rl.policies.baselines import NormalFlow, RandomPolicy, normal_policy
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.rollout.rows import read_trials
 
 Config = Callable[[str, list[str]], Any]
 SMALL = [

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from fb3d_rl.models.artflownet import ArtFlowNet
-from fb3d_rl.perception.contact import ContactOptions
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
+from fb3d_rl.policies.contact import ContactOptions
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, artflownet_policy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits

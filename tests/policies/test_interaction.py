@@ -20,9 +20,7 @@ from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.env.workers import CollectorOptions, Workers
-from fb3d_rl.evaluation.rollout import policy_env, state_of
-from fb3d_rl.perception.contact import LAYOUT
+from fb3d_rl.policies.contact import LAYOUT
 from fb3d_rl.policies.flow_policy import (
     APPROACH,
     PULL,
@@ -36,6 +34,8 @@ from fb3d_rl.policies.flow_policy import (
 from fb3d_rl.policies.gates import make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, HumanGate, InteractivePolicy, OracleGate, uniform
+from fb3d_rl.rollout.collectors import CollectorOptions, Workers
+from fb3d_rl.rollout.run import policy_env, state_of
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 POINTS = 40

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from fb3d_rl.algos import setup
 from fb3d_rl.geometry.points import knn, pca_curvature
-from fb3d_rl.perception.contact import ContactOptions, choose_contact
+from fb3d_rl.policies.contact import ContactOptions, choose_contact
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 
 CAMERA = torch.tensor([[-3.0, 0.0, 1.0]])

@@ -12,13 +12,13 @@ from tensordict.nn import TensorDictModuleBase
 from fb3d_rl.algos.dagger import acting_policy
 from fb3d_rl.algos.kinds import KINDS
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.rollout import mask_of
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import MASK, FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import Learner, LearnerOptions
 from fb3d_rl.policies.truths import TOLD, table
+from fb3d_rl.rollout.run import mask_of
 
 LIMITS = VelocityLimits(2.0, 3.0)
 MASKED, MASKLESS = FlowPolicyOptions(), FlowPolicyOptions(mask="none")

@@ -1,0 +1,1 @@
+"""Throughput, as ratios against peers that are measured in the same run."""

@@ -1,0 +1,395 @@
+"""The live page: a thin face of :class:`~fb3d_rl.live.session.Session` in the browser.
+
+It is made with viser, which serves sliders and a 3D scene from Python, tells where a mesh was clicked, and brings its
+own client, so that it works offline. Rerun's viewer shows what is logged to it but asks nothing of a person; plotly
+with Dash sends the whole figure anew for each move of a slider.
+
+viser calls back in threads of its own, but network and simulator run in one: a callback leaves a wish behind, and the
+loop that owns the session fulfils it. Of a slider's many positions only the last one counts.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fb3d_rl.assets.articulation import Mesh
+from fb3d_rl.camera.views import View, look_at
+from fb3d_rl.drawing.shade import GRIPPER, Color, link_colors, srgb
+from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
+from fb3d_rl.errors import UserError
+from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
+from fb3d_rl.live.server import HOST, start_server
+from fb3d_rl.live.session import Moment, Session
+
+COLORS: dict[str, Color] = {"predicted": FLOW, "true": srgb("#2c9f5b")}
+"""Of the arrows of each flow."""
+
+LABELS = {"predicted": "Predicted flow (orange)", "true": "True flow (green)"}
+"""Of the boxes that show them."""
+
+SEEN, PART, CONTACT, CAMERA = srgb("#868e99"), srgb("#1f4f8f"), srgb("#e0218a"), srgb("#5b6470")
+"""Of points of the cloud, of those on the part, of the contact point and of the camera."""
+
+ARROWS = 50
+"""Arrows of each flow."""
+
+LENGTH = 0.13
+"""Length of an arrow of flow 1, in diameters of the object."""
+
+
+def require_viser() -> Any:
+    """The module viser.
+
+    Raises:
+        UserError: it is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise UserError(f'the live page needs viser ({error}); install it: pip install "fb3d_rl[view]"') from error
+    return viser
+
+
+def serve(session: Session, port: int, until: Callable[[], bool] = lambda: False) -> None:
+    """Serve the page and fulfil what is wished there, until Ctrl-C.
+
+    Args:
+        session: what is shown; it is closed in the end.
+        port: where to listen; where it is taken, the next free one is used. What is used is printed.
+        until: asked between wishes whether to end.
+
+    Raises:
+        UserError: viser is not installed.
+    """
+    require_viser()
+    name = f"{session.obj.category} {session.obj.id}"
+    logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers open connections that they do not use
+    server = start_server(port, name)
+    try:
+        page = Page(server, session)
+        taken = "" if server.get_port() == port else f" (port {port} is taken)"
+        print(f"{name}: http://{HOST}:{server.get_port()}{taken}; Ctrl-C ends it", flush=True)
+        while not until():
+            page.attend()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()
+        session.close()
+
+
+class Page:
+    """Controls and 3D scene of a session.
+
+    Args:
+        server: a ``viser.ViserServer``.
+        session: what is shown.
+    """
+
+    def __init__(self, server: Any, session: Session) -> None:
+        self._server, self._session = server, session
+        self._wishes: dict[object, Callable[[], None]] = {}
+        self._wake = threading.Condition()
+        self._playing = False
+        self._part = -1
+        self._bodies: list[Any] = []
+        self._held: bool | None = None
+        server.gui.configure_theme(
+            control_layout="collapsible", control_width="large", show_logo=False, show_share_button=False
+        )
+        server.scene.set_up_direction("+z")
+        server.scene.add_grid("/ground", width=6.0, height=6.0, cell_size=0.25, plane="xy")
+        self._camera = server.scene.add_camera_frustum(
+            "/camera", fov=session.field_of_view, aspect=1.0, scale=0.06 * session.size, color=CAMERA
+        )
+        server.on_client_connect(self._welcome)
+        self._controls()
+        self._draw()
+
+    # -------------------------------------------------------------------------------------------------- wishes
+
+    def _wish(self, key: object, fulfil: Callable[[], None]) -> None:
+        """Ask for something from any thread; a later wish of the same key takes its place."""
+        with self._wake:
+            self._wishes.pop(key, None)
+            self._wishes[key] = fulfil
+            self._wake.notify()
+
+    def attend(self, patience: float = 0.5) -> None:
+        """Fulfil what is wished; wait at most ``patience`` s for a wish, or make a control step while it plays."""
+        with self._wake:
+            if not self._wishes and not self._playing:
+                self._wake.wait(patience)
+            wishes, self._wishes = list(self._wishes.values()), {}
+        begun = time.monotonic()
+        if not wishes and not self._playing:
+            return
+        try:
+            self._say("")
+            for fulfil in wishes:
+                fulfil()
+            if self._playing:
+                self._step()
+        except UserError as error:
+            self._playing = False
+            self._say(f"**{error}**")
+        self._draw()
+        if self._playing:  # no faster than the robot
+            with self._wake:
+                if not self._wishes:
+                    self._wake.wait(max(0.0, begun + self._session.period - time.monotonic()))
+
+    def _step(self) -> None:
+        if self._session.trial is None and not self._session.loaded:
+            self._say("Loading the simulator …")
+        self._session.step()
+        trial = self._session.trial
+        self._playing &= trial is not None and not trial.done
+
+    def _act(self, button: str) -> None:
+        self._playing = button == "Play"
+        if button == "Step":
+            self._step()
+        elif button == "Reset":
+            self._session.reset()
+
+    # ------------------------------------------------------------------------------------------------ controls
+
+    def _controls(self) -> None:
+        gui, session = self._server.gui, self._session
+
+        def on_change(handle: Any, set_to: Callable[[Any], None]) -> None:
+            @handle.on_update
+            def _(event: Any) -> None:
+                if event.client is not None:  # and not by this page itself
+                    self._wish(f"set {id(handle)}", lambda: self._change(lambda: set_to(event.target.value)))
+
+        gui.set_panel_label(f"{session.obj.category} {session.obj.id}")
+        names = {f"{session.obj.links[i].semantic} · {session.obj.links[i].name}": i for i in session.parts}
+        self._part_names = {link: name for name, link in names.items()}
+        self._part_control = gui.add_dropdown("Open", list(names), initial_value=self._part_names[session.link])
+        on_change(self._part_control, lambda name: session.set_part(names[name]))
+        with gui.add_folder("Policy"):
+            acts = gui.add_dropdown(
+                "Acts on", [f"{name} flow" for name in session.flows], initial_value=f"{session.flow} flow"
+            )
+            on_change(acts, lambda name: session.set_flow(name.removesuffix(" flow")))
+            buttons = gui.add_button_group("Trial", ("Step", "Play", "Pause", "Reset"))
+
+            @buttons.on_click
+            def _(event: Any) -> None:
+                button = str(event.target.value)
+                self._wish(object(), lambda: self._act(button))  # each press counts
+
+            self._status = gui.add_markdown("")
+            self._message = gui.add_markdown("")
+        with gui.add_folder("Flow"):
+            self._measured = gui.add_markdown("")
+            self._shown = {name: gui.add_checkbox(LABELS[name], True) for name in reversed(session.flows)}
+            self._shown["cloud"] = gui.add_checkbox("Points that the camera sees", True)
+            for box in self._shown.values():
+                box.on_update(lambda event: self._wish("show", lambda: None))
+        with gui.add_folder("Joints"):
+            self._joints = []
+            for j, (low, high) in enumerate(session.limits):
+                link = session.obj.links[session.obj.movable[j]]
+                slides = session.obj.joint_of(session.obj.movable[j]).type == "prismatic"
+                unit, scale = ("cm", 100.0) if slides else ("°", 180 / np.pi)
+                slider = gui.add_slider(
+                    f"{link.semantic} · {link.name} ({unit})",
+                    min=round(scale * low, 1),
+                    max=max(round(scale * high, 1), round(scale * low, 1) + 0.1),
+                    step=0.1,
+                    initial_value=round(scale * float(session.moment.qpos[j]), 1),
+                )
+                on_change(slider, partial(self._set_joint, j, scale))
+                self._joints.append((slider, scale))
+        with gui.add_folder("Camera of the policy"):
+            self._azimuth = gui.add_slider(
+                "Azimuth (°)", min=-180, max=180, step=1, initial_value=round(session.view.azimuth)
+            )
+            self._elevation = gui.add_slider(
+                "Elevation (°)", min=0, max=89, step=1, initial_value=round(session.view.elevation)
+            )
+            on_change(self._azimuth, lambda value: session.set_view(View(float(value), session.view.elevation)))
+            on_change(self._elevation, lambda value: session.set_view(View(session.view.azimuth, float(value))))
+
+    def _change(self, change: Callable[[], None]) -> None:
+        self._playing = False
+        change()
+
+    def _set_joint(self, joint: int, scale: float, value: float) -> None:
+        self._session.set_joint(joint, value / scale)
+
+    def _say(self, text: str) -> None:
+        if self._message.content != text:
+            self._message.content = text
+
+    def _welcome(self, client: Any) -> None:
+        """Stand a new guest where the object, its open parts and the hand are in sight."""
+        session = self._session
+        view = View(0.7 * session.view.azimuth - 15.0, 24.0)
+        client.camera.up_direction = (0.0, 0.0, 1.0)
+        client.camera.position = look_at(view, session.centre, 1.15 * session.size)[:3, 3]
+        client.camera.look_at = session.centre
+
+    # ------------------------------------------------------------------------------------------------- drawing
+
+    def _draw(self) -> None:
+        """Show the session's moment."""
+        moment = self._session.moment
+        with self._server.atomic():
+            if self._part != self._session.link:
+                self._build()
+            self._place(moment)
+            self._arrows(moment)
+            self._cloud(moment)
+            self._aim(moment)
+            self._write(moment)
+        self._server.flush()
+
+    def _mesh(self, name: str, meshes: Sequence[Mesh], color: Color, **look: Any) -> Any:
+        """One node of all ``meshes``, or none in place of an empty one."""
+        meshes = [mesh for mesh in meshes if len(mesh.faces)]
+        if not meshes:
+            self._server.scene.remove_by_name(name)
+            return None
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+        vertices = np.concatenate([mesh.vertices for mesh in meshes])
+        faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
+        return self._server.scene.add_mesh_simple(
+            name, vertices.astype(np.float32), faces.astype(np.uint32), color=color, side="double", **look
+        )
+
+    def _build(self) -> None:
+        """The object's links, of which those that open can be clicked."""
+        session = self._session
+        self._part = session.link
+        carried = session.obj.descendants(session.link)
+        self._bodies = []
+        for i, (link, color) in enumerate(zip(session.obj.links, link_colors(session.obj, session.link), strict=True)):
+            body = self._mesh(f"/object/{i}", link.visuals, color, flat_shading=True)
+            if body is not None and i in carried:
+                body.on_click(self._clicked)
+            self._bodies.append(body)
+
+    def _clicked(self, event: Any) -> None:
+        self._wish("pick", lambda: self._session.pick(*_ray(event.client.camera, event.screen_pos)))
+
+    def _place(self, moment: Moment) -> None:
+        """Put the bodies where they are; the gripper is there in a trial only."""
+        links = len(self._session.obj.links)
+        acting = len(moment.poses) > links
+        if acting and len(self._bodies) == links:
+            meshes = self._session.gripper
+            self._bodies += [self._mesh(f"/gripper/{i}", mesh, GRIPPER) for i, mesh in enumerate(meshes)]
+        elif not acting and len(self._bodies) > links:
+            for body in self._bodies[links:]:
+                body.remove()
+            del self._bodies[links:]
+        held = moment.trial.attached if moment.trial is not None else None
+        if acting and held != self._held:
+            self._cup = self._mesh("/gripper/0/cup", [cup_mesh(self._session.gripper)], HOLDING if held else FREE)
+        self._held = held
+        for body, pose in zip([*self._bodies, self._camera], [*moment.poses, moment.camera], strict=True):
+            if body is not None:
+                body.position = pose[:3, 3]
+                body.wxyz = matrix_to_quaternion(torch.as_tensor(pose[:3, :3])).numpy()
+
+    def _cloud(self, moment: Moment) -> None:
+        if not self._shown["cloud"].value or not len(moment.points):
+            self._server.scene.remove_by_name("/cloud")
+            return
+        colors = np.where(moment.part[:, None], PART, SEEN)
+        self._server.scene.add_point_cloud(
+            "/cloud",
+            moment.points,
+            (255 * colors).astype(np.uint8),
+            point_size=0.004 * self._session.size,
+            point_shape="circle",
+        )
+
+    def _arrows(self, moment: Moment) -> None:
+        """The flows beside each other: every other of the points that move has an arrow of the one or of the other."""
+        norms = np.max([np.linalg.norm(flow, axis=-1) for flow in moment.flows.values()], axis=0)
+        moving = np.flatnonzero(norms > 0.1)[: len(moment.flows) * ARROWS]  # clouds are in random order
+        for turn, (name, flow) in enumerate(moment.flows.items()):
+            rows = moving[turn :: len(moment.flows)]
+            rows = rows[np.linalg.norm(flow[rows], axis=-1) > 0.05] if self._shown[name].value else rows[:0]
+            length = LENGTH * self._session.size
+            starts, ways = moment.points[rows].astype(np.float64), length * flow[rows].astype(np.float64)
+            meshes = arrow_mesh(starts, ways, 0.045 * length) if len(rows) else []
+            self._mesh(f"/flow/{name}", meshes, COLORS[name])
+
+    def _aim(self, moment: Moment) -> None:
+        """The contact point as a ball, an arrow along the pull, and a thin one from where the hand will stand."""
+        scene, contact, size = self._server.scene, moment.contact, self._session.size
+        if contact is None:
+            for name in ("point", "pull", "approach"):
+                scene.remove_by_name(f"/contact/{name}")
+            return
+        scene.add_icosphere("/contact/point", radius=0.011 * size, color=CONTACT, position=contact.point)
+        pull = _arrow(contact.point, 1.6 * LENGTH * size * contact.pull, 0.008 * size)
+        self._mesh("/contact/pull", pull, CONTACT)
+        way = 0.09 * size * contact.standoff
+        self._mesh("/contact/approach", _arrow(contact.point + 1.25 * way, -way, 0.005 * size), GRIPPER)
+
+    def _write(self, moment: Moment) -> None:
+        """Numbers and words, and the controls where they follow what happens."""
+        if moment.metrics:
+            self._measured.content = (
+                f"Predicted: cosine **{moment.metrics['cosine']:.3f}** · RMSE **{moment.metrics['rmse']:.3f}**"
+            )
+        elif "predicted" in moment.flows:
+            self._measured.content = "The camera sees nothing that moves."
+        else:
+            self._measured.content = "For ArtFlowNet's flow beside the true one give `checkpoint=pretrained`."
+        self._status.content = _status(moment, self._playing)
+        session = self._session
+        self._part_control.value = self._part_names[session.link]
+        for (slider, scale), position in zip(self._joints, moment.qpos, strict=True):
+            wanted = float(np.clip(round(scale * position, 1), slider.min, slider.max))
+            if abs(slider.value - scale * position) > 0.1:
+                slider.value = wanted
+        for slider, angle in ((self._azimuth, session.view.azimuth), (self._elevation, session.view.elevation)):
+            if slider.value != round(angle):
+                slider.value = round(angle)
+
+
+def _ray(camera: Any, place: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Origin (m) and direction [3] of the ray through a place in a guest's picture: columns and rows from 0 to 1.
+
+    viser's events tell the ray as well, but not rightly in each of its versions.
+    """
+    across, down = (2.0 * np.array(place) - 1.0) * math.tan(0.5 * camera.fov) * [camera.aspect, 1.0]
+    rotation = quaternion_to_matrix(torch.as_tensor(np.asarray(camera.wxyz, dtype=np.float64))).numpy()
+    return np.asarray(camera.position, dtype=np.float64), rotation @ [across, down, 1.0]
+
+
+def _status(moment: Moment, playing: bool) -> str:
+    """What is going on, in a line or two."""
+    trial = moment.trial
+    if trial is None:
+        if moment.contact is None:
+            return "No contact point can be chosen from what the camera sees."
+        return "Click the blue part to choose another contact point."
+    if trial.done:
+        outcome = "**opened**" if trial.success else "**not opened** in time"
+    else:
+        outcome = ("" if playing else "paused in phase ") + f"**{trial.phase}**"
+    held = "holds the part" if trial.attached else "holds nothing"
+    return f"step {trial.steps}: {outcome}, {held}\n\nnormalized distance **{trial.distance:.2f}**"
+
+
+def _arrow(start: NDArray[np.float32], vector: NDArray[np.float32], radius: float) -> list[Mesh]:
+    return arrow_mesh(start[None].astype(np.float64), vector[None].astype(np.float64), radius)

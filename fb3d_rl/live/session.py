@@ -1,0 +1,404 @@
+"""One object in a person's hands: its joints, what the camera sees of it, the flow, the contact point, and a trial.
+
+Nothing here knows of a page; the simulator is loaded when a trial begins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import step_mdp
+
+from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.assets.gripper import TIP
+from fb3d_rl.camera.views import View
+from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.env.options import EnvOptions, default_trial
+from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
+from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation.flow import predict
+from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.kinematics.opening import box_bounds, box_corners
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.contact import choose_contact
+from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
+from fb3d_rl.policies.hand import hand_axis
+from fb3d_rl.rollout.run import limits_of, policy_env
+from fb3d_rl.rollout.trials import schedule
+
+if TYPE_CHECKING:
+    from fb3d_rl.env.task import OpenArticulatedEnv
+
+FLOWS = {"true": ("privileged", "flow"), "predicted": ("prediction", "flow")}
+"""Where a policy can have its flow from: the true flow makes the expert."""
+
+PICK = 0.02
+"""Of the points that are at most this much (m) farther from a ray than the nearest one, the foremost is meant."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """Where the hand touches (m), which way it pulls there and on which side it stands (unit vectors), [3] each."""
+
+    point: NDArray[np.float32]
+    pull: NDArray[np.float32]
+    standoff: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How a trial goes.
+
+    Attributes:
+        steps: control steps made.
+        phase: the policy's, one of :data:`fb3d_rl.policies.flow_policy.PHASES`.
+        distance: normalized distance, 1 at the start and 0 at the joint's limit.
+        attached: whether suction holds the part.
+        success: whether the part counts as open.
+        done: whether the trial is over.
+    """
+
+    steps: int
+    phase: str
+    distance: float
+    attached: bool
+    success: bool
+    done: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """What there is to see.
+
+    Attributes:
+        poses: T_world_body [L, 4, 4] of the links; in a trial [L + 3, 4, 4] with hand, left and right finger.
+        qpos: joint state [J], rad or m.
+        camera: T_world_camera [4, 4]; x right, y down, z forward.
+        points: the M points of the cloud [M, 3], m.
+        part: [M], whether a point lies on the part to open.
+        flows: the true and, with a network, the predicted flow [M, 3] by their names in :data:`FLOWS`.
+        metrics: of the prediction (:func:`fb3d_rl.flow.metrics.flow_metrics`); empty where there is nothing to measure.
+        contact: where the policy touches, or would; None where it has no such aim.
+        trial: how the trial goes; None if none runs.
+    """
+
+    poses: NDArray[np.float64]
+    qpos: NDArray[np.float64]
+    camera: NDArray[np.float64]
+    points: NDArray[np.float32]
+    part: NDArray[np.bool_]
+    flows: dict[str, NDArray[np.float32]]
+    metrics: dict[str, float]
+    contact: Contact | None
+    trial: Progress | None
+
+
+class Session:
+    """An object, the part of it to open, a joint state, a view, and at times a trial that the policy runs from there.
+
+    It begins with the trial that an evaluation of the same seed runs with the object's first part. Whatever a person
+    changes ends a running trial, and is seen where the object stands then.
+
+    Args:
+        obj: the object.
+        samples: points of a cloud, views and camera.
+        env: the task's constants.
+        policy: speeds and thresholds of the flow policy.
+        net: predicts the flow; without one there is the true flow only.
+        flow: which of :data:`FLOWS` the policy is given; the predicted one if there is a network, unless given.
+        device: where the network computes.
+        seed: of views and clouds.
+
+    Raises:
+        UserError: the object has no part that opens, or the policy needs a network and there is none.
+    """
+
+    def __init__(
+        self,
+        obj: ArticulatedObject,
+        samples: SampleOptions,
+        env: EnvOptions,
+        policy: FlowPolicyOptions,
+        net: ArtFlowNet | None = None,
+        flow: str | None = None,
+        device: torch.device | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.obj = obj
+        self.flows = [name for name in FLOWS if name == "true" or net is not None]
+        self._object = ObjectView(obj, samples.camera)
+        self._env_options, self._policy_options = env, policy
+        self._net, self._device = net, device or torch.device("cpu")
+        self._env: EnvBase | None = None
+        self._base: TrialEnv | None = None
+        self._points = samples.points
+        first = default_trial(obj)  # says so if nothing opens
+        self._trials = {item.trial.link: item.trial for item in schedule([(obj, "")], samples, seed)[0]}
+        self.parts = self._object.openable
+        """Links that open."""
+        self.set_flow(flow or self.flows[-1])
+        self.set_part(next(iter(self._trials), first.link))
+
+    # ------------------------------------------------------------------------------------------- what a person sets
+
+    def set_flow(self, name: str) -> None:
+        """Let the policy act on the flow of this name.
+
+        Raises:
+            UserError: there is no network to predict it.
+        """
+        if name not in self.flows:
+            raise UserError(f"there is no {name} flow without a network; give its weights: checkpoint=PATH")
+        self.flow = name
+        self._policy = FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options)
+        self._picked: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+
+    def set_part(self, link: int) -> None:
+        """Choose the part to open, with the joint state and the view that an evaluation would start from."""
+        self._trial = self._trials.get(link) or default_trial(self.obj, link)
+        self._look()
+
+    def set_joint(self, index: int, position: float) -> None:
+        """Move joint ``index`` of the joint state [J] to a position, rad or m."""
+        state = self.moment.qpos.copy()
+        state[index] = np.clip(position, *self.limits[index])
+        self._trial = replace(self._trial, start=tuple(state.tolist()))
+        self._look()
+
+    def set_view(self, view: View) -> None:
+        """Put the camera elsewhere."""
+        self._trial = replace(self._trial, view=view, start=tuple(self.moment.qpos.tolist()))
+        self._look()
+
+    def reset(self) -> None:
+        """Put everything back to where the trial began, or would begin."""
+        self._look()
+
+    @property
+    def link(self) -> int:
+        """The part to open."""
+        return self._trial.link
+
+    @property
+    def view(self) -> View:
+        """Where the camera stands."""
+        return self._trial.view
+
+    @property
+    def limits(self) -> NDArray[np.float64]:
+        """Lowest and highest position of each joint [J, 2], rad or m; half a turn each way where it has no limits."""
+        return np.where(np.isfinite(self.obj.limits), self.obj.limits, [-np.pi, np.pi])
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """The point [3] that the camera looks at, m."""
+        return self._object.camera.centre
+
+    @property
+    def size(self) -> float:
+        """Diameter of the closed object's bounding sphere, m."""
+        return 2 * self._object.camera.radius
+
+    @property
+    def field_of_view(self) -> float:
+        """The camera's, rad."""
+        return math.radians(self._object.camera.options.fov)
+
+    @property
+    def period(self) -> float:
+        """Time (s) of a control step."""
+        return 1.0 / self._env_options.control_freq
+
+    def pick(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> None:
+        """Let the policy touch the point of the part that a ray meets, in place of the one that it would choose.
+
+        Args:
+            origin: where the ray begins [3], m.
+            direction: where it goes [3].
+
+        Raises:
+            UserError: the part is not seen, does not move there, is held already, or the trial is over.
+        """
+        if self.trial is not None and (self.trial.attached or self.trial.done):
+            raise UserError("the hand is past the choice of a contact point; press reset to choose another")
+        obs, flow = self._frame["observation"], self._frame[FLOWS[self.flow]]
+        on_part = self._shown()[0].nonzero().flatten()
+        if not len(on_part):
+            raise UserError("the camera sees nothing of the part; turn it until it does")
+        way = obs["points"][0, on_part].double() - torch.as_tensor(origin)
+        ray = torch.as_tensor(direction)
+        along = way @ (ray / ray.norm())
+        aside = (way.square().sum(-1) - along.square()).clamp_min(0).sqrt()
+        row = int(on_part[torch.where(aside <= aside.min() + PICK, along, torch.inf).argmin()])
+        norm = flow[0].norm(dim=-1)
+        others = torch.ones_like(obs["valid"])
+        others[0, row] = False
+        picked = self._choose(others)
+        if not torch.equal(picked[0][0], obs["points"][0, row]):
+            raise UserError(
+                f"the {self.flow} flow there is {float(norm[row]):.2f}, too little to pull along; "
+                "pick a point that moves"
+            )
+        self._picked = picked
+        if self.trial is not None:
+            self._policy.send(self._frame["policy"], obs, picked)
+        self.moment = self._moment()
+
+    # ------------------------------------------------------------------------------------------------- what is seen
+
+    def _look(self) -> None:
+        """See the object as it stands at the start of the trial, without the simulator."""
+        trial, object_view = self._trial, self._object
+        qpos = np.array(trial.start)
+        # The generator of a trial's first cloud, so that it is the same one.
+        points, links = object_view.cloud(qpos, trial.view, self._points, np.random.default_rng([trial.seed, 0]))
+        frame = object_view.sample(links, points, qpos, trial.link)[None]
+        poses = object_view.poses(qpos).numpy()
+        tip = self._env_options.gripper.start(box_bounds(box_corners(self.obj), poses)) + [TIP, 0, 0]
+        frame["observation", "tool_pose"] = torch.tensor([[*tip, 1, 0, 0, 0]], dtype=torch.float32)
+        camera = object_view.camera.pose(trial.view)[:3, 3]
+        frame["observation", "camera_position"] = torch.tensor(camera[None], dtype=torch.float32)
+        self.trial: Progress | None = None
+        self._picked = None
+        self._frame = self._predicted(frame)
+        self._poses, self._qpos = poses, qpos
+        self.moment = self._moment()
+
+    def _predicted(self, frame: TensorDictBase) -> TensorDictBase:
+        if self._net is not None:
+            frame["prediction", "flow"] = predict(self._net, frame, self._device)
+        return frame
+
+    def _moment(self) -> Moment:
+        frame = self._frame
+        valid = frame["observation", "valid"]
+        flows = {name: frame[FLOWS[name]] for name in self.flows}
+        metrics = {}
+        if "predicted" in flows:
+            measured = flow_metrics(flows["predicted"], flows["true"], valid)
+            metrics = {key: float(value) for key, value in measured.items() if bool(value.isfinite())}
+        return Moment(
+            poses=self._poses,
+            qpos=self._qpos,
+            camera=self._object.camera.pose(self.view),
+            points=frame["observation", "points"][valid].numpy(),
+            part=frame["observation", "part_mask"][valid].numpy(),
+            flows={name: flow[valid].numpy() for name, flow in flows.items()},
+            metrics=metrics,
+            contact=self._contact(),
+            trial=self.trial,
+        )
+
+    def _contact(self) -> Contact | None:
+        """Where the policy touches, or would if it began now."""
+        phase = SELECT if self.trial is None else PHASES.index(self.trial.phase)
+        if phase == SELECT:
+            point, pull, standoff, _ = self._picked or self._choose()
+        elif phase in (TRAVEL, APPROACH, PULL):
+            point, pull, standoff = (self._frame["policy", key] for key in ("contact_point", "pull", "standoff"))
+            if phase == PULL:
+                point = self._frame["observation", "tool_pose"][:, :3]
+        else:
+            return None
+        return Contact(point[0].numpy(), pull[0].numpy(), standoff[0].numpy()) if bool(pull.any()) else None
+
+    def _shown(self) -> Tensor:
+        """The points [1, N] that the policy may touch: those of the part, or all if it is not told which they are."""
+        obs = self._frame["observation"]
+        return obs["valid"] if self._policy_options.mask == "none" else obs["valid"] & obs["part_mask"]
+
+    def _choose(self, avoid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
+        obs, options = self._frame["observation"], self._policy_options.contact
+        shown = self._shown()
+        flow = torch.where(shown[..., None], self._frame[FLOWS[self.flow]], 0.0)
+        if avoid is None:
+            avoid = torch.zeros_like(shown)
+        else:  # a person may want a point that the heuristic does not consider
+            options = replace(options, min_flow=0.0, weak_flow=0.0)
+        pose = obs["tool_pose"]
+        return choose_contact(
+            obs["points"],
+            obs["valid"],
+            None if self._policy_options.mask == "none" else shown,
+            flow,
+            obs["camera_position"],
+            pose[:, :3],
+            hand_axis(pose),
+            avoid,
+            options,
+        )
+
+    # ------------------------------------------------------------------------------------------------------ a trial
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """Make one control step; the first one of a trial begins it. After its last one nothing happens.
+
+        Raises:
+            UserError: the simulator cannot be loaded, or the part is fully open already.
+        """
+        if self.trial is None:
+            self._begin()
+        elif self.trial.done:
+            return
+        assert self._env is not None
+        frame = self._env.step(self._policy(self._frame))
+        over = bool(frame["next", "done"])
+        self._seen(step_mdp(frame), over)
+
+    def _begin(self) -> None:
+        require_simulator("look at flow and contact points alone")
+        if self._base is None or self._env is None:
+            self._base = make_env([self.obj], self._env_options)
+            self._env = policy_env(self._base)
+        self._base.set_trials([self._trial])
+        frame = self._env.reset()
+        if self._picked is not None:
+            self._policy.send(frame["policy"], frame["observation"], self._picked)
+        self._seen(frame, False)
+
+    def _seen(self, frame: TensorDictBase, over: bool) -> None:
+        """Take in what the trial has led to."""
+        assert self._base is not None
+        task = cast("OpenArticulatedEnv", self._base.env)
+        self._frame = self._predicted(frame)
+        self._poses = task.stages[0].poses()
+        positions = task.joint_positions()[0, : len(self.obj.movable)].double().numpy()
+        self._qpos = np.clip(positions, *self.limits.T)  # the solver has slack
+        self.trial = Progress(
+            steps=int(frame["elapsed_steps"]),
+            phase=PHASES[int(frame["policy", "phase"])],
+            distance=float(frame["normalized_distance"]),
+            attached=bool(frame["observation", "attached"]),
+            success=bool(frame["success"]),
+            done=over,
+        )
+        self.moment = self._moment()
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the simulator is there already."""
+        return self._base is not None
+
+    @property
+    def gripper(self) -> Sequence[Sequence[Mesh]]:
+        """Meshes of hand, left and right finger, each in its own frame; once a trial has begun."""
+        assert self._base is not None
+        task: Any = self._base.env
+        return task.stages[0].model.gripper
+
+    def close(self) -> None:
+        """Free the simulator."""
+        if self._env is not None:
+            self._env.close(raise_if_closed=False)
+            self._env = self._base = None

@@ -1,0 +1,301 @@
+"""Where to touch: the contact-point heuristic (supplement, I.E and I.F) with a check that the hand can get there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from fb3d_rl.assets.gripper import HAND_LENGTH
+from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
+from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion, screw
+from fb3d_rl.geometry.transforms import normalize
+
+CANDIDATES = 64
+"""Points of a cloud that are remembered as candidates."""
+
+LAYOUT = (3, 3, 3, 1)
+"""What a candidate consists of: its point (m), unit flow and standoff, and its share of the cloud's largest flow."""
+
+CANDIDATE = sum(LAYOUT)
+
+
+@dataclass(frozen=True)
+class ContactOptions:
+    """Thresholds of the contact-point heuristic.
+
+    Attributes:
+        neighbors: points that make a neighbourhood.
+        curvature: PCA curvature above which a point is no good place for a suction cup.
+        rim: a point whose neighbours on the part lie to one side is on its rim: largest distance from the point to
+            their mean, as a share of their mean distance.
+        min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
+        min_flow: share of the cloud's largest flow that a contact point must have.
+        near: what a metre from the hand counts against a point, in shares of the largest flow. The larger, the
+            more the choice depends on where the hand is, and the less on which points the camera happens to see; with
+            0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
+        turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
+        facing: cosine between flow and surface normal below which the hand approaches along the normal.
+        collisions: whether the hand's way to the point, and with the part from there, has to be free of the cloud and
+            the ground. Without it the supplement's rule is left: what is flat is good.
+        hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
+        clearance: where that cylinder starts, in front of the point, m.
+        reach: where that cylinder ends, m.
+        run_up: straight way (m) that the tip needs above the ground before it touches.
+        weak_flow: share of the largest flow that does if no point with more can be moved freely.
+        candidates: points whose way along the flow is checked.
+        sweep: how far along its way a point has to be free, m; ``sweep_angle`` (rad) if that is less.
+        sweep_steps: places along the way that are checked.
+    """
+
+    neighbors: int = 12
+    curvature: float = 0.03
+    rim: float = 0.45
+    min_distance: float = 0.02
+    min_flow: float = 0.5
+    near: float = 10.0
+    turning: float = 1.0
+    facing: float = 0.35
+    collisions: bool = True
+    hand_radius: float = 0.055
+    clearance: float = 0.06
+    reach: float = 0.6
+    run_up: float = 0.1
+    weak_flow: float = 0.1
+    candidates: int = 64
+    sweep: float = 1.0
+    sweep_angle: float = 1.6
+    sweep_steps: int = 8
+
+
+def choose_contact(
+    points: Tensor,
+    valid: Tensor,
+    part: Tensor | None,
+    flow: Tensor,
+    camera: Tensor,
+    hand: Tensor,
+    axis: Tensor,
+    avoid: Tensor,
+    options: ContactOptions,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Choose where to touch each cloud and from which side.
+
+    Of the points with at least ``min_flow`` of the largest flow the one that is worth most, foremost the nearest to
+    the hand, is taken if it is a good place for a suction cup: the surface is flat around it (PCA curvature), it is no
+    rim of the part, the hand can come and go along with it, and it was not tried before. (The supplement takes the
+    largest flow; where several points have nearly that, small differences send the hand now here, now there, and no
+    learner can follow.) Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is
+    good, the demands are dropped one after the other. The hand comes against the flow (I.F). Where the flow runs along
+    the surface, as on a sliding sash, or into it, it comes against the surface's normal instead; where something
+    stands in the way, along the normal or the line of sight, which is free as far as the camera sees.
+
+    Args:
+        points: [B, N, 3] world points, m; the ground is z = 0.
+        valid: [B, N] bool.
+        part: [B, N] bool, points of the part to open. Without it the flow says what moves, and each point's way is that
+            of the motion around it, since several parts may move; all else stands in the way.
+        flow: [B, N, 3] flow of the part to open, 0 elsewhere; without ``part`` of whatever moves.
+        camera: [B, 3] position of the camera, which tells a surface's outside.
+        hand: [B, 3] position of the suction tip, m.
+        axis: [B, 3] unit direction from the tip to the hand.
+        avoid: [B, N] bool, points not to be touched (tried in vain before).
+        options: thresholds.
+
+    Returns:
+        Contact point [B, 3], unit flow there [B, 3], unit direction [B, 3] in which the hand stands off it, and the
+        points that would do as well [B, CANDIDATES, CANDIDATE], for :func:`best_candidate`. All are 0 for a cloud
+        without flow; so are the candidates beyond the last one.
+    """
+    norm = flow.norm(dim=-1).masked_fill(~valid, 0.0)
+    largest = norm.amax(-1, keepdim=True)
+    cloud, seen = points, valid
+    obstacle = valid & ~(norm > 0.05 * largest if part is None else part)
+    moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen
+    if not len(moving):
+        nothing = torch.zeros_like(camera)
+        return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
+    points, valid, flow, avoid, norm = (x[:, moving] for x in (points, valid, flow, avoid, norm))
+    body = None if part is None else part[:, moving] & valid
+    on_part = valid & (norm > 0.05 * largest) & (largest > 0)
+    weak = on_part & (norm >= options.weak_flow * largest)
+    movable = weak & (norm >= options.min_flow * largest)
+    squared = squared_distances(points, cloud)
+    among = squared[:, :, moving].masked_fill_(~on_part[:, None], torch.inf)
+    nearest = among.topk(min(options.neighbors, len(moving)), largest=False)  # as knn finds them
+    curvature, normals = pca_curvature(points, nearest, on_part, camera)
+    direction = normalize(flow)
+    along = (direction * normals).sum(-1, keepdim=True)
+    sight = normalize(camera[:, None] - points)
+    usual = torch.where(along >= options.facing, direction, normals)
+    if options.collisions:
+        usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+        as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
+    else:
+        as_usual = torch.ones_like(weak)
+
+    # The first free way; the usual one where none is.
+    free, standoff = as_usual, usual
+    for way in (normals, sight):
+        todo = (weak & ~free).any(0).nonzero().flatten()
+        opened = torch.zeros_like(free)
+        opened[:, todo] = ~_blocked(points[:, todo], cloud, squared[:, todo], seen, way[:, todo], options)
+        opened &= ~free
+        free, standoff = free | opened, torch.where(opened[..., None], way, standoff)
+
+    smooth = (curvature <= options.curvature) & ~_rim(points, nearest, options)
+    fresh = ~avoid
+    share = norm / largest.clamp_min(1e-9)
+    worth = _worth(share, points, standoff, hand, axis, options)
+    peak = torch.where(movable & fresh, worth, torch.full_like(norm, -torch.inf)).argmax(-1)
+    rows = torch.arange(len(points), device=points.device)
+    distance = (points - points[rows, peak][:, None]).norm(dim=-1)
+    reachable = weak & smooth & fresh & free
+    clear = reachable
+    if options.collisions:
+        clear = _clear(points, body, flow, cloud, obstacle, standoff, reachable, distance, options)
+
+    tiers = [
+        movable & smooth & as_usual & fresh & clear,
+        movable & smooth & free & fresh & clear,
+        reachable & clear,
+        movable & smooth & free & fresh,
+        movable & free & fresh,
+        movable & smooth & fresh,
+        movable & fresh,
+        movable,
+    ]
+    score = torch.stack([tier.any(-1) for tier in tiers], dim=-1).int().argmax(-1)  # the first tier with a point
+    good = torch.stack(tiers, dim=1).gather(1, score[:, None, None].expand(-1, 1, valid.shape[1])).squeeze(1)
+
+    far_enough = good & (distance >= options.min_distance)
+    near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
+    index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
+    found = movable.any(-1)[:, None]
+    candidate = torch.cat([points, direction, standoff, share[..., None]], dim=-1)
+    *chosen, _ = torch.where(found, candidate[rows, index], 0.0).split(LAYOUT, dim=-1)
+    first = good.int().argsort(dim=-1, descending=True, stable=True)[:, :CANDIDATES]  # clouds are in random order
+    kept = gather(torch.where((good & found)[..., None], candidate, 0.0), first)
+    return *chosen, torch.nn.functional.pad(kept, (0, 0, 0, CANDIDATES - kept.shape[1]))
+
+
+def best_candidate(candidates: Tensor, hand: Tensor, axis: Tensor, options: ContactOptions) -> Tensor:
+    """The candidate [B, CANDIDATE] that is worth most to a hand that has come elsewhere meanwhile.
+
+    Args:
+        candidates: [B, CANDIDATES, CANDIDATE] of :func:`choose_contact`.
+        hand: [B, 3] position of the suction tip, m.
+        axis: [B, 3] unit direction from the tip to the hand.
+        options: thresholds.
+    """
+    points, _, standoff, share = candidates.split(LAYOUT, dim=-1)
+    worth = _worth(share.squeeze(-1), points, standoff, hand, axis, options)
+    best = worth.masked_fill(share.squeeze(-1) == 0, -torch.inf).argmax(-1)
+    return candidates[torch.arange(len(best), device=best.device), best]
+
+
+def _worth(
+    share: Tensor, points: Tensor, standoff: Tensor, hand: Tensor, axis: Tensor, options: ContactOptions
+) -> Tensor:
+    """What points [B, N] are worth to a hand: their share of the largest flow, less the way there and the turning."""
+    way = (points - hand[:, None]).norm(dim=-1)
+    return share - options.near * way - options.turning * (1 - (standoff * axis[:, None]).sum(-1))
+
+
+def _rim(points: Tensor, nearest: tuple[Tensor, Tensor], options: ContactOptions) -> Tensor:
+    """Whether the part's points ``nearest`` to each point (:func:`knn`) lie to one side of it, [B, N] bool."""
+    squared, index = nearest
+    weight = squared.isfinite().to(points.dtype)[..., None]
+    total = weight.sum(2).clamp_min(1.0)
+    mean = (gather(points, index) * weight).sum(2) / total
+    spread = (squared.clamp_max(1e6).sqrt() * weight[..., 0]).sum(2) / total[..., 0]
+    return (mean - points).norm(dim=-1) > options.rim * spread
+
+
+def _blocked(
+    points: Tensor, cloud: Tensor, squared: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions
+) -> Tensor:
+    """Whether the cloud, or the ground, is in the cylinder that the hand needs before each point, [B, M] bool.
+
+    ``squared`` [B, M, N] are the squared distances from the M points to the N of the cloud.
+    """
+    middle, half = (options.reach + options.clearance) / 2, (options.reach - options.clearance) / 2
+    # In place and with one comparison: memory for M times N numbers takes longer to come by than to fill.
+    ahead = (standoff @ cloud.mT).sub_((standoff * points).sum(-1, keepdim=True))  # [B, M, N]
+    outside = torch.addcmul(squared, ahead, ahead, value=-1).sub_(options.hand_radius**2)
+    beyond = ahead.sub_(middle).abs_().sub_(half)
+    inside = (torch.maximum(outside, beyond, out=outside) < 0).logical_and_(valid[:, None])
+    return (inside.sum(-1, dtype=torch.int32) > 1) | _underground(points, standoff, options)
+
+
+def _underground(points: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
+    """Whether the hand's far end would come from below the ground z = 0, [B, N] bool."""
+    return points[..., 2] + (options.run_up + HAND_LENGTH) * standoff[..., 2] < 0
+
+
+def _clear(
+    points: Tensor,
+    part: Tensor | None,
+    flow: Tensor,
+    cloud: Tensor,
+    obstacle: Tensor,
+    standoff: Tensor,
+    wanted: Tensor,
+    distance: Tensor,
+    options: ContactOptions,
+) -> Tensor:
+    """Which points the hand can hold all along their way with the part, [B, M] bool.
+
+    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet the cloud's
+    points of ``obstacle`` or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the
+    smallest to the largest ``distance``; the others count as not clear.
+    """
+    count = min(options.candidates, points.shape[1])
+    order = torch.where(wanted, distance, torch.inf).argsort(-1)
+    among = torch.linspace(0, 1, count, device=points.device) * (wanted.sum(-1, keepdim=True) - 1).clamp_min(0)
+    index = order.gather(1, among.round().long())  # [B, K]
+    contact, away = gather(points, index), gather(standoff, index)
+    centre, velocity, omega = _motions(points, part, flow, contact)
+    speed = (velocity + torch.linalg.cross(omega, contact - centre)).norm(dim=-1)
+    time = options.sweep / speed.clamp_min(1e-6)
+    time = torch.minimum(time, options.sweep_angle / omega.norm(dim=-1).clamp_min(1e-6))
+    share = torch.linspace(0, 1, options.sweep_steps + 1, device=points.device)[1:]
+    turn, shift = screw(velocity[:, :, None], omega[:, :, None], time[..., None] * share)  # [B, K, steps, 3, 3]
+    arm, away = (contact - centre)[:, :, None, :, None], away[:, :, None, :, None]
+    at = (turn @ arm).squeeze(-1) + shift + centre[:, :, None]
+    reach = torch.linspace(options.clearance, HAND_LENGTH, 3, device=points.device)
+    hand = at[..., None, :] + reach[:, None] * (turn @ away).mT  # [B, K, steps, balls, 3]
+    meets = torch.stack(
+        [
+            _within(balls, stuff[mask], options.hand_radius)
+            for balls, stuff, mask in zip(hand, cloud, obstacle, strict=True)
+        ]
+    )
+    clear = (~meets & (hand[..., 2] > 0)).flatten(2).all(-1)
+    result = torch.zeros_like(wanted).scatter(1, index, clear)
+    return result & wanted
+
+
+def _motions(points: Tensor, part: Tensor | None, flow: Tensor, contact: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Centre, its velocity and the angular velocity [B, 1 or K, 3] with which the points ``contact`` [B, K, 3] move.
+
+    All of them with the part; without a mask each with what moves around it.
+    """
+    if part is not None:
+        centre = (points * part[..., None]).sum(1) / part.sum(-1, keepdim=True).clamp_min(1)
+        velocity, omega = rigid_motion(points, flow, part.to(points.dtype), centre, 1e-4)
+        return centre[:, None], velocity[:, None], omega[:, None]
+    weight = local_weight(flow[:, None], squared_distances(contact, points))
+    count = contact.shape[1]
+    cloud, moves = (x[:, None].expand(-1, count, -1, -1).flatten(0, 1) for x in (points, flow))
+    velocity, omega = rigid_motion(cloud, moves, weight.flatten(0, 1), contact.flatten(0, 1), 1e-4)
+    return contact, velocity.view_as(contact), omega.view_as(contact)
+
+
+def _within(points: Tensor, others: Tensor, radius: float) -> Tensor:
+    """Whether any of others [N, 3] is nearer than ``radius`` to each point [..., 3]; by a search tree, on the CPU."""
+    distance, _ = cKDTree(others.cpu()).query(points.flatten(0, -2).cpu(), distance_upper_bound=radius)
+    return torch.from_numpy(np.isfinite(distance)).to(points.device).view(points.shape[:-1])

@@ -1,0 +1,235 @@
+"""The page that compares several runs, and the table of its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import plotly.graph_objects as go
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation import comparison, tables
+from fb3d_rl.evaluation.comparison import Comparison, Group
+from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, SUCCESS
+from fb3d_rl.report import curves, failure_charts, page
+from fb3d_rl.report.blocks import COPIED, FACTS, bars, broken, effort, terms, write
+from fb3d_rl.report.gallery import Shown, films, gallery
+from fb3d_rl.report.page import text
+from fb3d_rl.rollout.rows import TrialRow
+
+
+def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = ()) -> Path:
+    """Write a comparison as one HTML file that needs no network, and its numbers beside it as a CSV file.
+
+    Args:
+        found: the comparison.
+        out: the HTML file; the table has the same name with .csv in the end.
+        unfinished: folders of runs that are not part of it, named on the page.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        UserError: ``out`` cannot be written.
+    """
+    labels = [entry.label for entry in found.entries]
+    labels += [group.label for group in found.groups if group.label not in labels]
+    colors = {label: page.color(i) for i, label in enumerate(labels)}
+    logs = [(group.label, colors[group.label], [run.log for run in group.runs]) for group in found.groups]
+    learned = curves.learning_curves(logs)
+    steps = [(name, color, log) for name, color, of_runs in logs for log in of_runs]
+    body = (
+        f"<header><h1>{_title(found)}</h1>{_left_out(unfinished)}</header>"
+        + page.section("Results", _entry_table(found, colors), _split_entries(found, colors))
+        + page.section("Side by side", _entry_bars(found, colors))
+        + page.section("How trials ended", _ends(found))
+        + page.section("What it took", effort(found.numbers, colors))
+        + page.section("Differences on the same trials", _difference_tables(found, colors))
+        + page.section("Success by category", _entry_categories(found, colors))
+        + page.section("Trials", _trials(found, colors))
+        + page.section("Learning curves", learned)
+        + page.section("Flow", _flow_table(found))
+        + page.section("Training", curves.training(steps, skip=curves.OVER_LABELS if learned else ()))
+        + page.section("How the numbers come about", _told(found))
+        + page.section("What was run", *map(_group_facts, found.groups))
+    )
+    write(out, "Comparison · fb3d_rl", body)
+    try:
+        comparison.write_csv(found, out.with_suffix(".csv"))
+    except OSError as error:
+        raise UserError(f"Cannot write {out.with_suffix('.csv')}: {error.strerror}.") from error
+    return out
+
+
+def _title(found: Comparison) -> str:
+    count = sum(len(group.names) for group in found.groups)
+    return f"Comparison of {count} run{'s' * (count != 1)}"
+
+
+def _left_out(unfinished: Sequence[Path]) -> str:
+    if not unfinished:
+        return ""
+    names = ", ".join(path.name for path in unfinished)
+    return f'<p class="error">Left out, not finished (no summary.json): {text(names)}</p>'
+
+
+def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> str:
+    """A row per policy; of one split, or of all trials."""
+    numbers = found.numbers["by_split"][split] if split else found.numbers
+    entries = [entry for entry in found.entries if f"{entry.label}/n" in numbers]
+    if not entries:
+        return ""
+    several = not split and any(len(entry.seeds) > 1 for entry in entries)
+    labelled = not split and any(entry.labels is not None for entry in entries)
+    head = ["policy", "success", "success, class mean"] + ["success, range over seeds"] * several
+    head += ["contact", "normalized distance"] + ["labels", "expert steps"] * labelled
+    body = ""
+    for entry in entries:
+        body += f'<tr class="mean">{page.named(entry.label, colors[entry.label])}'
+        body += page.cell(*comparison.cells(entry, numbers, SUCCESS))
+        body += page.cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean"))
+        if several:
+            body += page.cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–")
+        body += page.cell(*comparison.cells(entry, numbers, CONTACT)) + page.cell(
+            *comparison.cells(entry, numbers, DISTANCE)
+        )
+        if labelled:
+            body += page.cell(comparison.show_labels(entry.labels)) + page.cell(
+                comparison.show_share(entry.expert_share)
+            )
+        body += "".join(f"<td>{numbers[f'{entry.label}/{key}']}</td>" for key in ("n", "n_objects"))
+        body += f"<td>{text(comparison.show_seeds(entry))}</td>"
+        body += "</tr>"
+    note = "" if split else '<p class="soft">Small print: 95 % intervals with objects as the unit, see below.</p>'
+    return note + page.plain_table([*head, "trials", "objects", "seeds"], body)
+
+
+def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
+    splits = found.numbers.get("by_split", {})
+    return "".join(f"<h3>Split {text(name)}</h3>{_entry_table(found, colors, name)}" for name in splits)
+
+
+def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
+    """Instance means in the policies' colours."""
+    blocks = []
+    lines = max((1 + broken(entry.label).count("<br>") for entry in found.entries), default=1)
+    for metric in (SUCCESS, DISTANCE) if found.entries else ():
+        plot = go.Figure()
+        for entry in found.entries:
+            key = f"{entry.label}/{metric.key}"
+            value = (found.numbers.get(key), found.numbers.get(f"{key}_ci95"))
+            bars(plot, entry.label, colors[entry.label], [entry.label], [value])
+        plot.update_layout(
+            template="none",
+            barmode="overlay",
+            bargap=0.4,
+            height=70 + max(34, 10 + 16 * lines) * len(found.entries),
+            margin={"l": 8, "r": 16, "t": 12, "b": 40},
+            showlegend=False,
+            xaxis={
+                "tickformat": ".0%" if metric.percent else ".1f",
+                "rangemode": "tozero",
+                "title": {"text": f"{metric.label}, with 95 % interval"},
+            },
+            yaxis={"autorange": "reversed", "automargin": True, "ticksuffix": "  "},
+        )
+        if metric.percent:
+            plot.update_xaxes(range=[0, 1.02])
+        blocks.append(page.figure(metric.key, plot))
+    return page.grid(blocks) if blocks else ""
+
+
+def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:
+    bodies: dict[str, str] = {}
+    for three in comparison.by_pair(found):
+        label = three[0].entry.label
+        row = f'<tr class="mean">{page.named(label, colors[label])}{page.cell(str(three[0].n))}'
+        row += "".join(page.cell(*comparison.show_difference(d.metric, d.means)) for d in three)
+        bodies[three[0].baseline.label] = bodies.get(three[0].baseline.label, "") + row + "</tr>"
+    head = ("policy", "trials", *(m.label + ", points" * m.percent for m in comparison.DIFFERENCES))
+    return "".join(f"<h3>Minus {text(name)}</h3>{page.plain_table(head, body)}" for name, body in bodies.items())
+
+
+def _entry_categories(found: Comparison, colors: Mapping[str, str]) -> str:
+    if not found.entries:
+        return ""
+    body = ""
+    for category, values in found.numbers["by_category"].items():
+        shown = (comparison.cells(entry, values, SUCCESS) for entry in found.entries)
+        objects = {(r.category, r.object) for e in found.entries for r in e.rows.values() if r.category == category}
+        cells = page.cell(str(len(objects))) + "".join(page.cell(*cell) for cell in shown)
+        body += f'<tr class="mean"><td class="text">{text(category)}</td>{cells}</tr>'
+    head = "".join(
+        f'<th class="group" style="--swatch:{colors[entry.label]}">{text(entry.label)}</th>' for entry in found.entries
+    )
+    head = f'<th class="text">category</th><th>objects</th>{head}'
+    return page.table(f"<tr>{head}</tr>", body)
+
+
+def _flow_table(found: Comparison) -> str:
+    """A row per group that measured a flow network, all seeds together."""
+    body = ""
+    for group in found.groups:
+        rows = [row for run in group.runs for row in run.flow]
+        if not rows:
+            continue
+        cells = page.cell(str(sum(bool(run.flow) for run in group.runs))) + page.cell(str(len(rows)))
+        for metric in FLOW:
+            measured = tables.measure(rows, metric)
+            cells += page.cell(metric.show(measured.instance), metric.show_interval(measured.instance_ci95))
+            cells += page.cell(metric.show(measured.class_), metric.show_interval(measured.class_ci95))
+        body += f'<tr class="mean"><td class="text">{text(group.label)}</td>{cells}</tr>'
+    names = (metric.label.removeprefix("flow ") for metric in FLOW)
+    head = ["run", "seeds", "clouds", *(cell for name in names for cell in (name, f"{name}, class mean"))]
+    return page.plain_table(head, body) if body else ""
+
+
+def _told(found: Comparison) -> str:
+    labelled = any(entry.labels is not None for entry in found.entries)
+    read = terms([run.summary for group in found.groups for run in group.runs])
+    return page.facts([*read, *(entry for entry in comparison.METHOD if entry[0] != "Labels" or labelled)])
+
+
+def _group_facts(group: Group) -> str:
+    """What was run, told once where all runs of the group agree."""
+    facts: list[tuple[str, object]] = [("Runs", ", ".join(group.names))]
+    for key, label in FACTS.items():
+        values = dict.fromkeys(str(run.summary[key]) for run in group.runs if run.summary.get(key) not in (None, ""))
+        if label in COPIED:
+            facts += [(label, value) for value in values]
+        elif values:
+            facts.append((label, ", ".join(values) if key in ("seed", "git_revision") else " | ".join(values)))
+    return f"<h3>{text(group.label)}</h3>{page.facts(facts, COPIED)}"
+
+
+def _ends(found: Comparison) -> str:
+    return failure_charts.blocks({entry.label: list(entry.rows.values()) for entry in found.entries})
+
+
+def _trials(found: Comparison, colors: Mapping[str, str]) -> str:
+    """The trials of all entries, those on the same part beside each other."""
+    filmed = {
+        (run.path, *_about(run.seed, row)): path
+        for group in found.groups
+        for run in group.runs
+        for row, path in films(run).items()
+    }
+    shown = []
+    for entry in found.entries:
+        for (seed, *_), row in entry.rows.items():
+            paths = (filmed.get((run.path, *_about(seed, row))) for group in entry.groups for run in group.runs)
+            film = next((path for path in paths if path is not None), None)
+            shown.append(Shown(row, entry.label, colors[entry.label], film, seed))
+    place = list(colors).index
+    shown.sort(key=lambda trial: (*_part(trial), place(trial.policy)))
+    return gallery(shown)
+
+
+def _about(seed: int | None, row: TrialRow) -> tuple[object, ...]:
+    """What tells the trials of a run apart."""
+    return seed, row.policy, row.split, row.category, row.object, row.link, row.seed
+
+
+def _part(trial: Shown) -> tuple[object, ...]:
+    row = trial.row
+    return -1 if trial.seed is None else trial.seed, row.category, row.object, row.link, row.seed

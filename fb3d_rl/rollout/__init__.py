@@ -1,0 +1,1 @@
+"""From trials to rows: one row per scheduled trial, whatever happens in it."""
