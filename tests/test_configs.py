@@ -446,7 +446,8 @@ def test_splits_can_be_given_as_a_name_an_id_or_a_list(split: str) -> None:
 
 
 TEXTS = (
-    ROOT / "README.md",
+    *sorted(ROOT.glob("*.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
     *sorted((ROOT / "results").glob("**/*.md")),
     *sorted((ROOT / "launch").glob("*.py")),
     *sorted(CONF.glob("**/*.yaml")),

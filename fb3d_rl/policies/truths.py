@@ -1,6 +1,6 @@
 """What each evaluated policy is told that a camera and the hand's own joints do not show.
 
-This is the one statement of it: a test compares it with the keys that the policies read, and the README shows it.
+This is the one statement of it: a test compares it with the keys that the policies read, and with docs/protocols.md.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ def viewer(clouds: Sequence[dict[str, Any]]) -> str:
     """Two linked 3D scenes, true next to predicted flow, on a narrow page one above the other.
 
     Args:
-        clouds: per cloud "title"; "rest" and "part": coordinates of the points as [3][n] lists; "true" and
-            "predicted": {"start": [a][3], "vector": [a][3]}; "box": range of each axis, [3][2]; "size":
+        clouds: per cloud "title"; "rest" and "part": coordinates of the points, three lists of n; "true" and
+            "predicted": {"start", "vector"}, lists of a triples; "box": range of each axis, three pairs; "size":
             length (m) at which a flow of norm 1 is drawn.
     """
     colors = {"rest": STATIC, "part": PART, "true": TRUE, "predicted": PREDICTED}

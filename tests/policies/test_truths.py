@@ -58,9 +58,9 @@ def test_a_policy_reads_what_is_declared(name: str) -> None:
     assert mask_of(policy) == ("target" if told.mask else "" if name == "random" else "none")
 
 
-def test_no_policy_is_missing_and_the_readme_says_the_same() -> None:
+def test_no_policy_is_missing_and_the_documents_say_the_same() -> None:
     assert set(POLICIES) == set(TOLD)
-    assert table() in (Path(__file__).parents[2] / "README.md").read_text()
+    assert table() in (Path(__file__).parents[2] / "docs" / "protocols.md").read_text()
 
 
 def test_without_a_mask_the_network_s_module_reads_none_either() -> None:
