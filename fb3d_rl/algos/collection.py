@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
-from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
@@ -21,6 +21,7 @@ from fb3d_rl.rollout import demonstrations
 from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.demonstrations import episode_info
 from fb3d_rl.rollout.trials import BARREN, draw_trials
+from fb3d_rl.scene.posed import Posed
 
 STEPS_OF_TRIAL = 60
 """Labels that a trial is reckoned to bring."""
@@ -50,7 +51,7 @@ class Round:
 
 def collect(
     workers: Workers,
-    views: Sequence[ObjectView],
+    views: Sequence[Posed],
     samples: SampleOptions,
     rows: RowsOptions,
     number: int,

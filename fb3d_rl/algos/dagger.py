@@ -29,7 +29,6 @@ from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstra
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
-from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.models.artflownet import ArtFlowNet
@@ -43,6 +42,7 @@ from fb3d_rl.rollout.collectors import Workers, steady_floats
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
 from fb3d_rl.rollout.trials import schedule
+from fb3d_rl.scene.posed import Posed
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, Objective, check_state, fit, generator
@@ -142,7 +142,7 @@ class Run:
         entries = setup.train_entries(cfg.assets, out, cfg.seed)
         self.entries = entries.train
         self.objects, self.tested = [entry.load() for entry in entries.train], setup.load(entries.held_out)
-        self.views = [ObjectView(obj, self.protocol.samples.camera) for obj in self.objects]
+        self.views = [Posed(obj, self.protocol.samples.camera) for obj in self.objects]
         limit = algo.validate_trials
         self.validated = setup.load(entries.validation)
         if limit and not self.validated:

@@ -136,6 +136,10 @@ class Trial:
     seed: int = 0
     goal: float | None = None
 
+    def cloud_rng(self, step: int = 0) -> np.random.Generator:
+        """Draws the cloud after so many control steps: one for each, so that a restored state sees the same again."""
+        return np.random.default_rng([self.seed, step])
+
 
 Start = Literal["reference", "closed", "random"]
 """How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""

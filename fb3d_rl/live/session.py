@@ -6,9 +6,8 @@ Nothing here knows of a page; the simulator is loaded when a trial begins.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -18,22 +17,23 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.gripper import TIP
 from fb3d_rl.camera.views import View
-from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions, flow_sample
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.flow.metrics import flow_metrics
-from fb3d_rl.kinematics.opening import box_bounds, box_corners
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.contact import choose_contact
 from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
 from fb3d_rl.policies.hand import hand_axis
 from fb3d_rl.rollout.run import limits_of, policy_env
 from fb3d_rl.rollout.trials import schedule
+from fb3d_rl.scene.observer import observe
+from fb3d_rl.scene.posed import Posed
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
@@ -135,7 +135,7 @@ class Session:
     ) -> None:
         self.obj = obj
         self.flows = [name for name in FLOWS if name == "true" or net is not None]
-        self._object = ObjectView(obj, samples.camera)
+        self._object = Posed(obj, samples.camera)
         self._env_options, self._policy_options = env, policy
         self._net, self._device = net, device or torch.device("cpu")
         self._env: EnvBase | None = None
@@ -257,20 +257,18 @@ class Session:
 
     def _look(self) -> None:
         """See the object as it stands at the start of the trial, without the simulator."""
-        trial, object_view = self._trial, self._object
-        qpos = np.array(trial.start)
-        # The generator of a trial's first cloud, so that it is the same one.
-        points, links = object_view.cloud(qpos, trial.view, self._points, np.random.default_rng([trial.seed, 0]))
-        frame = object_view.sample(links, points, qpos, trial.link)[None]
-        poses = object_view.poses(qpos).numpy()
-        tip = self._env_options.gripper.start(box_bounds(box_corners(self.obj), poses)) + [TIP, 0, 0]
+        trial, posed = self._trial, self._object
+        poses = posed.poses(trial.start)
+        cloud = observe(posed, poses, trial.view, self._points, trial.cloud_rng())
+        frame = flow_sample(cloud, trial.link)[None]
+        tip = self._env_options.gripper.start(posed.bounds(trial.start)) + [TIP, 0, 0]
         frame["observation", "tool_pose"] = torch.tensor([[*tip, 1, 0, 0, 0]], dtype=torch.float32)
-        camera = object_view.camera.pose(trial.view)[:3, 3]
+        camera = posed.camera.pose(trial.view)[:3, 3]
         frame["observation", "camera_position"] = torch.tensor(camera[None], dtype=torch.float32)
         self.trial: Progress | None = None
         self._picked = None
         self._frame = self._predicted(frame)
-        self._poses, self._qpos = poses, qpos
+        self._poses, self._qpos = poses, np.array(trial.start)
         self.moment = self._moment()
 
     def _predicted(self, frame: TensorDictBase) -> TensorDictBase:
@@ -389,13 +387,6 @@ class Session:
     def loaded(self) -> bool:
         """Whether the simulator is there already."""
         return self._base is not None
-
-    @property
-    def gripper(self) -> Sequence[Sequence[Mesh]]:
-        """Meshes of hand, left and right finger, each in its own frame; once a trial has begun."""
-        assert self._base is not None
-        task: Any = self._base.env
-        return task.stages[0].model.gripper
 
     def close(self) -> None:
         """Free the simulator."""

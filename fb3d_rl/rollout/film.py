@@ -95,7 +95,7 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
                 frame = env.step(frame)
                 done = bool(frame["next", "done"])
                 frame = step_mdp(frame)
-        gripper = task.stages[0].model.gripper
+        gripper = task.stages[0].model.bodies
     finally:
         env.close(raise_if_closed=False)
     predicted = ("prediction", "flow") in frames[0].keys(include_nested=True)

@@ -18,7 +18,7 @@ from fb3d_rl.algos.screwnet import screw_loss, screw_objective
 from fb3d_rl.algos.ump_di import direction_cosine
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.kinematics.joint_screw import screw_of_flow
 from fb3d_rl.models.cloud_network import CloudNetwork
@@ -26,6 +26,7 @@ from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.rollout.rows import read_trials
+from fb3d_rl.scene.posed import Posed
 from fb3d_rl.training.fit import FitOptions, fit
 from fb3d_rl.training.run_log import RunLog, read_rows
 
@@ -61,7 +62,7 @@ def network(name: str) -> CloudNetwork:
 @pytest.fixture(scope="module")
 def door(procedural_objects: dict[str, ArticulatedObject]) -> TensorDictBase:
     """One cloud of a microwave, twice."""
-    view = ObjectView(procedural_objects["Microwave"], CameraOptions(resolution=48))
+    view = Posed(procedural_objects["Microwave"], CameraOptions(resolution=48))
     sample = draw_sample(view, SampleOptions(points=256, all_parts_share=0.0), np.random.default_rng(1))
     assert isinstance(sample, TensorDict)
     return sample.expand(2).clone()

@@ -16,9 +16,10 @@ from torchrl.data import LazyMemmapStorage, ReplayBuffer
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.scene.posed import Posed
 from fb3d_rl.training.fit import (
     FitOptions,
     augment,
@@ -145,7 +146,7 @@ def test_two_hundred_steps_learn_one_cloud(
     """
     if precision == "bf16" and emulates_bf16(torch.device("cpu")):
         pytest.skip("bfloat16 is emulated here, which takes minutes")
-    view = ObjectView(procedural_objects["Microwave"], CameraOptions(resolution=48))
+    view = Posed(procedural_objects["Microwave"], CameraOptions(resolution=48))
     sample = draw_sample(view, SampleOptions(points=200), np.random.default_rng(0))
     assert sample is not None
     rows = sample[None]
