@@ -446,11 +446,12 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
+        self.figure = None
 
     def handle_data(self, data: str) -> None:
         if self.figure:
             self.figures[self.figure] = json.loads(data)
-        elif self.cdata_elem is None:
+        elif self.cdata_elem is None and data.strip():
             self.text.append(data)
 
 
