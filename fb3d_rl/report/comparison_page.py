@@ -10,6 +10,14 @@ import plotly.graph_objects as go
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import comparison, tables
 from fb3d_rl.evaluation.comparison import Comparison, Group
+from fb3d_rl.evaluation.comparison_tables import (
+    show_difference,
+    show_labels,
+    show_seeds,
+    show_share,
+    show_value,
+    write_csv,
+)
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, SUCCESS
 from fb3d_rl.report import curves, failure_charts, page
 from fb3d_rl.report.blocks import COPIED, FACTS, bars, broken, effort, named, terms
@@ -54,7 +62,7 @@ def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = 
     ]
     page.write(out, "Comparison · fb3d_rl", _title(found), _left_out(unfinished), sections)
     try:
-        comparison.write_csv(found, out.with_suffix(".csv"))
+        write_csv(found, out.with_suffix(".csv"))
     except OSError as error:
         raise UserError(f"Cannot write {out.with_suffix('.csv')}: {error.strerror}.") from error
     return out
@@ -84,17 +92,17 @@ def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") 
     for entry in entries:
         cells = [
             named(entry.label, colors[entry.label]),
-            Cell(*comparison.cells(entry, numbers, SUCCESS)),
-            Cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean")),
+            Cell(*show_value(entry, numbers, SUCCESS)),
+            Cell(*show_value(entry, numbers, SUCCESS, "_class_mean")),
         ]
         if several:
             cells.append(Cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–"))
-        cells += [Cell(*comparison.cells(entry, numbers, metric)) for metric in (CONTACT, DISTANCE)]
+        cells += [Cell(*show_value(entry, numbers, metric)) for metric in (CONTACT, DISTANCE)]
         if labelled:
-            cells.append(Cell(comparison.show_labels(entry.labels)))
-            cells.append(Cell(comparison.show_share(entry.expert_share)))
+            cells.append(Cell(show_labels(entry.labels)))
+            cells.append(Cell(show_share(entry.expert_share)))
         cells += [Cell(str(numbers[f"{entry.label}/{key}"])) for key in ("n", "n_objects")]
-        rows.append(Row([*cells, Cell(comparison.show_seeds(entry))]))
+        rows.append(Row([*cells, Cell(show_seeds(entry))]))
     note = Note("Small print: 95 % intervals with objects as the unit, see below.")
     return [*[note] * (not split), Table.plain([*head, "trials", "objects", "seeds"], rows)]
 
@@ -138,7 +146,7 @@ def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> list[Blo
     rows: dict[str, list[Row]] = {}
     for three in comparison.by_pair(found):
         label = three[0].entry.label
-        cells = [Cell(*comparison.show_difference(d.metric, d.means)) for d in three]
+        cells = [Cell(*show_difference(d.metric, d.means)) for d in three]
         row = Row([named(label, colors[label]), Cell(str(three[0].n)), *cells])
         rows.setdefault(three[0].baseline.label, []).append(row)
     head = ("policy", "trials", *(m.label + ", points" * m.percent for m in comparison.DIFFERENCES))
@@ -151,7 +159,7 @@ def _entry_categories(found: Comparison, colors: Mapping[str, str]) -> list[Bloc
     rows = []
     for category, values in found.numbers["by_category"].items():
         objects = {(r.category, r.object) for e in found.entries for r in e.rows.values() if r.category == category}
-        cells = [Cell(*comparison.cells(entry, values, SUCCESS)) for entry in found.entries]
+        cells = [Cell(*show_value(entry, values, SUCCESS)) for entry in found.entries]
         rows.append(Row([Cell(category, word=True), Cell(str(len(objects))), *cells]))
     labels = [Cell(entry.label, color=colors[entry.label]) for entry in found.entries]
     return [Table([[Cell("category", word=True), Cell("objects"), *labels]], [rows])]
