@@ -29,7 +29,9 @@ from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.assets.gripper import BODIES, FINGERS, TOOL
 from fb3d_rl.camera.sapien import SENSOR, SapienCamera, add_visuals, camera_config, require_renderer
 from fb3d_rl.contract import ACTION_DIM
-from fb3d_rl.drawing.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
+from fb3d_rl.drawing.bodies import GRIPPER, Body, Part, link_colors
+from fb3d_rl.drawing.camera import Camera
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.env.gripper import FloatingSuctionGripper
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial, drawn_fraction
 from fb3d_rl.env.stage import OBJECT_BIT, Model, Stage

@@ -14,8 +14,10 @@ from PIL import Image, ImageDraw
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.shade import Body, Camera, Part, Studio, link_colors, srgb
+from fb3d_rl.drawing.bodies import Body, Part, link_colors, srgb
+from fb3d_rl.drawing.camera import Camera
 from fb3d_rl.drawing.signs import FAINT, INK, arrow_mesh, font
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.files import write_bytes
 from fb3d_rl.kinematics.opening import openable_links, opening_range, standing_pose
 from fb3d_rl.kinematics.tree import KinematicTree
