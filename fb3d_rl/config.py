@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from fb3d_rl.contract import UNTRAINED
 from fb3d_rl.errors import UserError
+from fb3d_rl.settings import UNTRAINED
 
 
 @dataclass

@@ -14,7 +14,9 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.gripper import BODIES, FINGERS, TOOL
 from fb3d_rl.camera.sapien import add_visuals
-from fb3d_rl.drawing.shade import GRIPPER, Body, Camera, Part, Studio, link_colors
+from fb3d_rl.drawing.bodies import GRIPPER, Body, Part, link_colors
+from fb3d_rl.drawing.camera import Camera
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.env.model import Model
 from fb3d_rl.env.options import SuctionOptions, Trial
 from fb3d_rl.env.suction import Suction

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.assets.gripper import gripper_meshes
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.drawing.shade import GRIPPER, Color, link_colors, srgb
+from fb3d_rl.drawing.bodies import GRIPPER, Color, link_colors, srgb
 from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix

@@ -9,8 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.drawing.shade import GRIPPER, Body, Camera, Color, Part, Placed, Studio, link_colors
+from fb3d_rl.drawing.bodies import GRIPPER, Body, Color, Part, Placed, link_colors
+from fb3d_rl.drawing.camera import Camera
 from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.geometry.points import farthest_point_sample
 from fb3d_rl.kinematics.opening import standing_bounds
 from fb3d_rl.rollout.film import Film

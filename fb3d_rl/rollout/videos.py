@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.shade import TARGET
+from fb3d_rl.drawing.bodies import TARGET
 from fb3d_rl.drawing.signs import FAINT, FREE, HOLDING, INK, TRACK, font, hex_color
 from fb3d_rl.drawing.video import encode
 from fb3d_rl.env.options import EnvOptions
