@@ -39,10 +39,11 @@ from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
-from fb3d_rl.rollout.collectors import Workers, steady_floats
+from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
 from fb3d_rl.rollout.trials import schedule
+from fb3d_rl.rollout.worker import steady_floats
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
 from fb3d_rl.training.fit import FitOptions, Objective, check_state, fit, generator

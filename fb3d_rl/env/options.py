@@ -136,6 +136,9 @@ class Trial:
     seed: int = 0
     goal: float | None = None
 
+    def __str__(self) -> str:
+        return f"object {self.object}, link {self.link}, seed {self.seed}"
+
 
 Start = Literal["reference", "closed", "random"]
 """How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""

@@ -16,8 +16,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.views import View
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.rollout.collectors import steady_floats
 from fb3d_rl.rollout.run import policy_env, state_of
+from fb3d_rl.rollout.worker import steady_floats
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
