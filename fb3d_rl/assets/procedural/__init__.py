@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
+from fb3d_rl.assets.procedural import appliances, frames, furniture, handheld, lidded
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
 from fb3d_rl.assets.splits import TRAIN_CATEGORIES
 from fb3d_rl.errors import UserError
@@ -23,13 +23,13 @@ from fb3d_rl.errors import UserError
 __all__ = ["FAMILIES", "ObjectSpec", "Part", "expand", "generate", "object_id", "sample"]
 
 FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
-    "StorageFurniture": cabinets.storage_furniture,
-    "Table": cabinets.table,
-    "Refrigerator": cabinets.refrigerator,
-    "Microwave": cabinets.microwave,
-    "Safe": cabinets.safe,
-    "Oven": cabinets.oven,
-    "Dishwasher": cabinets.dishwasher,
+    "StorageFurniture": furniture.storage_furniture,
+    "Table": furniture.table,
+    "Refrigerator": appliances.refrigerator,
+    "Microwave": appliances.microwave,
+    "Safe": appliances.safe,
+    "Oven": appliances.oven,
+    "Dishwasher": appliances.dishwasher,
     "WashingMachine": frames.washing_machine,
     "Door": frames.door,
     "Window": frames.window,
