@@ -33,13 +33,13 @@ def folder(tmp_path: Path, procedural_root: Path) -> Path:
 def parses(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The objects that were parsed."""
     parsed: list[Path] = []
-    read = partnet_mobility._Reader.read
+    read = partnet_mobility.PartNetReader.read
 
-    def counted(self: partnet_mobility._Reader) -> object:
+    def counted(self: partnet_mobility.PartNetReader) -> object:
         parsed.append(self.folder)
         return read(self)
 
-    monkeypatch.setattr(partnet_mobility._Reader, "read", counted)
+    monkeypatch.setattr(partnet_mobility.PartNetReader, "read", counted)
     return parsed
 
 
