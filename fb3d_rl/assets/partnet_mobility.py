@@ -29,7 +29,7 @@ LARGEST_OBJECT = 2**30
 """Most bytes of an object's meshes together."""
 
 REMARKS = 3
-"""So many remarks on an object are told in one line."""
+"""At most this many remarks on an object are shown in one line."""
 
 
 class PartNetReader(UrdfReader):
@@ -86,7 +86,7 @@ def _urdf_of(folder: Path) -> Path:
 
 
 def load_usable(folder: str | Path) -> ArticulatedObject:
-    """As :func:`load_object`, for whoever looks at the object or touches it.
+    """As :func:`load_object`, for an object that a camera has to see.
 
     Raises:
         UserError: as there, or no link has a mesh.
@@ -125,7 +125,7 @@ def read_category(folder: Path) -> str:
 
 
 def _sources(folder: Path, urdf: Path) -> list[Path]:
-    """All that an object is read from, which is not too much."""
+    """The files that an object is read from; too large ones are refused."""
     texts = [path for path in (urdf, folder / "semantics.txt") if path.is_file()]
     _bound(folder, *texts)
     inside = folder.resolve()
@@ -134,7 +134,7 @@ def _sources(folder: Path, urdf: Path) -> list[Path]:
         for path in folder.rglob("*")
         if path.suffix.lower() in MESHES
         and path.is_file()
-        # The reader refuses a link out of the folder; what it leads to is not to be looked at before.
+        # The reader refuses a link out of the folder; its target is not to be opened before.
         and (not path.is_symlink() or path.resolve().is_relative_to(inside))
     )
     size = sum(path.stat().st_size for path in meshes)
@@ -157,7 +157,7 @@ def _bound(folder: Path, *texts: Path) -> None:
 
 @dataclass(frozen=True)
 class Skipped:
-    """An object that could not be read, and the sentence that says why."""
+    """An object that could not be read, and the reason as a sentence."""
 
     id: str
     reason: str

@@ -36,20 +36,20 @@ DECOMPOSED = "mobility_cvx.urdf"
 """ManiSkill's URDF whose collision files hold several convex pieces each."""
 
 BROKEN = (ValueError, LookupError, AttributeError, TypeError, ArithmeticError, MemoryError, struct.error)
-"""What a mesh that is none makes its parser raise."""
+"""What the parsers of meshes raise for files that are no meshes."""
 
 FARTHEST = 1e4
-"""Largest coordinate, m, and largest joint limit, m or rad, that is believed."""
+"""Largest coordinate (m) that is accepted; a joint limit (m or rad) beyond it counts as infinite."""
 
 CORNERS = 4
-"""A solid has so many corners at least; a collision mesh with fewer collides as a thin plate where it moves."""
+"""The least number of corners of a solid; a moving collision mesh with fewer collides as a thin plate."""
 
 
 class UrdfReader:
     """Reads one URDF; keeps the meshes read so far, since visuals and collisions share them.
 
     Args:
-        folder: the object's folder, named like the object; meshes are looked up in it and may not lie outside.
+        folder: the object's folder, named like the object; its meshes must be inside of it.
         urdf: the file.
     """
 
@@ -87,7 +87,7 @@ class UrdfReader:
         for element in robot.findall("joint"):
             parent, child, joint = self.joint(element)
             if parent not in elements or child not in elements:
-                self.fail(f"joint {joint.name} joins {parent!r} and {child!r}, of which one is no link")
+                self.fail(f"joint {joint.name} joins {parent!r} and {child!r}, but one of them is no link")
             if child in joints:
                 self.fail(f"link {child!r} is the child of two joints")
             joints[child] = (parent, joint)
@@ -109,7 +109,7 @@ class UrdfReader:
         return tuple(links), (*lost, *dict.fromkeys(self.dropped)), lost
 
     def fail(self, what: str) -> NoReturn:
-        raise UserError(f"object {self.folder.name}: {what}; mend or remove {self.urdf}")
+        raise UserError(f"object {self.folder.name}: {what}; correct or remove {self.urdf}")
 
     def attribute(self, element: Element, name: str) -> str:
         value = element.get(name)
@@ -227,8 +227,8 @@ class UrdfReader:
     def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool) -> Mesh:
         """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.
 
-        ``seen``: it is only looked at, so that each point and triangle is enough once. What collides stays as it is:
-        the simulator makes hulls and surfaces of it.
+        ``seen``: cameras alone use it, so repeated points and triangles are removed. Collision meshes are left as they
+        are, since the simulator computes hulls from them.
         """
         key = (filename, scale.tobytes(), transform.tobytes(), seen)
         if key not in self.placed:
@@ -244,7 +244,7 @@ class UrdfReader:
                 moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
             if len(faces) and not abs(moved).max() <= FARTHEST:
                 self.fail(f"the mesh {filename} reaches {abs(moved).max():.3g} m from its link")
-            # A mirror image turns inside out what is seen from outside.
+            # Mirroring turns the outside of a surface inside.
             self.placed[key] = Mesh(moved, faces[:, ::-1] if np.prod(np.sign(scale)) < 0 else faces)
         return self.placed[key]
 

@@ -58,7 +58,7 @@ class Episode:
     Attributes:
         index: the trial's place in the list.
         frames: TensorDict [T], one frame per control step; None if the trial crashed.
-        error: what it crashed with.
+        error: the exception or death that ended it; "" if it did not crash.
     """
 
     index: int
@@ -67,26 +67,26 @@ class Episode:
 
 
 class Workers:
-    """Environment and policy in one or several workers, which take trials from one list, each the next one.
+    """Environment and policy in one or several workers, which take trials from one list in turn.
 
     Which worker runs a trial does not change its frames: a policy sees one environment at a time, on one thread. A
-    trial that raises an exception costs itself only. So does one whose worker dies, of a crash of the simulator's
-    library or of a signal: the worker is started again and goes on with the next trial. Trials for which there is no
-    worker, since none can be started, have that as their error.
+    trial that raises an exception is lost alone. So is one whose worker dies, of a crash of the simulator's library or
+    of a signal: the worker is started again and goes on with the next trial. Trials that no worker could run, since
+    none could be started, have that as their error.
 
-    To be used in a ``with`` statement, since workers stay, for further calls of :meth:`run`, until :meth:`close`. As
-    always with processes that Python spawns, a script may use them below ``if __name__ == "__main__":`` only.
+    Use them in a ``with`` statement: workers stay alive for further calls of :meth:`run` until :meth:`close`. As always
+    with processes that Python spawns, a script may start them below ``if __name__ == "__main__":`` only.
 
     Args:
         create_env_fn: makes an environment of one scene with a method ``set_trials``: each further reset starts the
             next of the trials that it is given, and none once they have run out.
         policy: the policy, on the CPU. Like ``create_env_fn`` it has to be picklable unless the backend is "direct".
-        options: where and how often.
+        options: where they run, and how many.
         horizon: an episode has at most this many steps.
         exploration_type: what TorchRL's probabilistic policies do.
 
     Raises:
-        UserError: Ray is asked for and not installed.
+        UserError: the backend is Ray, which is not installed.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Workers:
         if self._owns_ray:
             import ray
 
-            gc.collect()  # the finalizer of a collector that never came to be would start Ray anew
+            gc.collect()  # the finalizer of a collector whose start failed would start Ray again
             ray.shutdown()
         if self._folder is not None:
             self._folder.cleanup()
@@ -221,17 +221,17 @@ class Workers:
             results.put(None)
 
     def _started(self, worker: Worker) -> bool:
-        """Start a worker, unless it is; whether that went well. What did not is not the end of the run.
+        """Start a worker unless it is running; returns whether it runs. A failure does not end the run.
 
         Raises:
-            UserError: what keeps it from starting for the first time can be mended.
+            UserError: it fails to start for the first time, for a reason that the user can change.
         """
         try:
             worker.start()
         except Exception as error:
             if isinstance(error, UserError) and not worker.starts:
                 raise
-            if not self._stopping:  # by which processes end that are just being started
+            if not self._stopping:  # which ends processes while they are being started
                 log.exception("a worker could not be started")
             self._not_run = f"not run: a worker could not be started ({type(error).__name__}: {error})"
             return False
@@ -258,8 +258,8 @@ class Workers:
     def _packed(self, name: str, value: object) -> Path | bytes:
         """``value`` for the workers, pickled once for all of them.
 
-        It is a file where that can be, since a process takes what it is started with through a pipe, and Python waits
-        for ever for one that dies before it has read its megabytes of meshes.
+        For processes it is written to a file: arguments of a new process go through a pipe, and Python waits for ever
+        for a process that dies before it has read its megabytes of meshes.
         """
         content = pickle.dumps(value)
         if self._folder is None:
@@ -298,7 +298,7 @@ def _unpacked_env(content: Path | bytes) -> EnvBase:
 
 
 def _idle_env(create_env_fn: Callable[[], EnvBase]) -> EnvBase:
-    """The environment, in which no trial starts: TorchRL's collectors reset theirs before they are asked for any."""
+    """The environment without trials: TorchRL's collectors reset theirs when they are made, before the first trial."""
     env = create_env_fn()
     env.set_trials([])
     return env

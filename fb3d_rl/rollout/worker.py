@@ -25,9 +25,9 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def steady_floats() -> Iterator[None]:
-    """Compute as every worker does: on one thread, and with denormal numbers taken as 0, which is also faster.
+    """Compute as every worker does: on one thread, and with denormal numbers rounded to 0, which is also faster.
 
-    The number of threads decides how sums are split, hence the last bits of a network's output.
+    The number of threads decides how sums are split, and so the last bits of a network's output.
     """
     threads, tiny = torch.get_num_threads(), torch.tensor(torch.finfo(torch.float32).tiny)
     flush = bool(tiny / 2 == 0)
@@ -41,9 +41,9 @@ def steady_floats() -> Iterator[None]:
 
 
 class EpisodeCollector(Collector):
-    """A TorchRL collector that is asked for one episode at a time.
+    """A TorchRL collector that runs one episode per call.
 
-    Its environment has one scene and a method ``set_trials``, which says what the next resets start.
+    Its environment has one scene and a method ``set_trials``, which takes the trials that the next resets start.
     """
 
     def __repr__(self) -> str:
@@ -69,7 +69,7 @@ class EpisodeCollector(Collector):
 
 
 class WorkerDied(Exception):
-    """A worker is not there (any more); the message says why."""
+    """A worker does not run (any more); the message says why."""
 
 
 class Worker:
@@ -127,8 +127,8 @@ class Worker:
                 raise
             self._collector = None
             if self._process is None:
-                # Ray's: its finalizer would otherwise start Ray anew after Workers.close, and end this process when
-                # that has been gone for a minute.
+                # Ray's: otherwise its finalizer would start Ray again after Workers.close, and end this process a
+                # minute after Ray is gone.
                 collector.shutdown()
             raise WorkerDied(cause) from error
 
@@ -136,12 +136,12 @@ class Worker:
         """End it."""
         if self._collector is not None:
             if self._process is not None:
-                self._process.terminate()  # it keeps nothing, and to ask it to end takes seconds
+                self._process.terminate()  # it has nothing to save, and an orderly end takes seconds
             self._collector.shutdown()
         self._collector, self._process, self.starts = None, None, 0
 
     def _cause_of_death(self, error: Exception) -> str | None:
-        """What the worker died of, if a call that raised ``error`` found it dead; None if it lives."""
+        """What the worker died of, after a call of it raised ``error``; None if it is alive."""
         if self._process is None:
             from ray.exceptions import RayActorError
 

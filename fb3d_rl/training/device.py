@@ -13,7 +13,7 @@ from fb3d_rl.training.options import FitOptions
 
 
 class Rows(Protocol):
-    """What is drawn from: a TensorDict [R], TorchRL's replay buffer, or what else gives rows by their number."""
+    """Stored rows: a TensorDict [R], TorchRL's replay buffer, or anything else that is indexed by row numbers."""
 
     def __len__(self) -> int: ...
 
@@ -24,7 +24,7 @@ def require_compiler(device: torch.device) -> None:
     """Check that torch.compile can work.
 
     Raises:
-        UserError: it cannot, for want of a compiler.
+        UserError: it cannot, since there is no compiler.
     """
     try:
         torch.compile(torch.neg)(torch.ones(2, device=device))
@@ -41,21 +41,21 @@ def emulates_bf16(device: torch.device) -> bool:
 
 
 def products_of(options: FitOptions, device: torch.device) -> torch.autocast:
-    """The context in which a network's products are of the precision that the options say."""
+    """The context in which a network's products have the precision of the options."""
     return torch.autocast(device.type, torch.bfloat16, enabled=options.precision == "bf16")
 
 
 def resident(rows: Rows, device: torch.device | str, room: int, chunk: int = 1024) -> Rows:
-    """The rows in the memory of ``device``, where a step finds them without a copy from the host; as they are if they
-    take more than ``room`` bytes.
+    """The rows in the memory of ``device``, so that a step needs no copy from the host; unchanged if they take
+    more than ``room`` bytes.
     """
     one = rows[torch.arange(1)]
     if len(rows) * one.bytes() > room:
         return rows
-    held = one.to(device).new_empty(len(rows))
+    copy = one.to(device).new_empty(len(rows))
     for numbers in torch.arange(len(rows)).split(chunk):
-        held[numbers] = rows[numbers].to(device)
-    return cast(Rows, held)
+        copy[numbers] = rows[numbers].to(device)
+    return cast(Rows, copy)
 
 
 def tune_cpu() -> None:

@@ -41,9 +41,10 @@ def batch_rows(step: int, rows: int, options: FitOptions) -> Tensor:
 
 
 def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice = slice(None)) -> TensorDictBase:
-    """The flow samples of a batch, turned, mirrored, scaled, jittered and thinned out as the options say.
+    """The flow samples of a batch, turned, mirrored, scaled, jittered and thinned out according to the options.
 
-    What is drawn depends on the seed and the step alone, for the whole batch, whose part ``share`` is given.
+    Random numbers depend on the seed and the step alone: they are drawn for the whole batch, of which ``batch`` is the
+    part ``share``.
     """
     points, flow = batch["observation", "points"], batch["privileged", "flow"]
     valid, part_mask = batch["observation", "valid"], batch["observation", "part_mask"]

@@ -13,18 +13,18 @@ def deferred_interrupt() -> Iterator[threading.Event]:
     """Turn the first Ctrl-C into an event, so that a step is never cut in half; a second one interrupts at
     once.
     """
-    asked = threading.Event()
+    pressed = threading.Event()
     if threading.current_thread() is not threading.main_thread():
-        yield asked
+        yield pressed
         return
     previous = signal.getsignal(signal.SIGINT)
 
-    def ask(*_: object) -> None:
-        asked.set()
+    def press(*_: object) -> None:
+        pressed.set()
         signal.signal(signal.SIGINT, previous)
 
-    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGINT, press)
     try:
-        yield asked
+        yield pressed
     finally:
         signal.signal(signal.SIGINT, previous)

@@ -27,9 +27,9 @@ def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
 
 
 def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
-    """:func:`flow_loss` of a flow network on clouds that are augmented as the options say.
+    """:func:`flow_loss` of a flow network on clouds that are augmented according to the options.
 
-    ``share`` is the part of the whole batch that the objective is given.
+    ``share`` is the part of the whole batch that the objective is called with.
     """
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:

@@ -87,7 +87,7 @@ class FitState:
         self.model.load_state_dict(state["model"])
         self.optimizer.load_state_dict(state["optimizer"])
         for weights, moments in self.optimizer.state.items():
-            if moments["exp_avg"].shape != weights.shape:  # which Adam would find out in its first step
+            if moments["exp_avg"].shape != weights.shape:  # Adam would fail in its first step
                 raise ValueError("the optimizer's state is of other weights")
         if self.average is not None:
             self.average.module.load_state_dict(state["average"])
@@ -105,7 +105,7 @@ class FitState:
 
 
 def check_state(model: nn.Module, options: FitOptions, state: dict[str, Any]) -> None:
-    """Raise what :func:`fb3d_rl.training.fit.fit` would raise of a ``state`` to resume from, before any work.
+    """Raise before any work what :func:`fb3d_rl.training.fit.fit` would raise for a ``state`` to resume from.
 
     Leaves the model as it is.
 

@@ -127,8 +127,8 @@ def test_a_full_disk_costs_the_cache_alone(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("FB3D_CACHE_SAID", "")  # so that it is as before in the end
-    monkeypatch.delenv("FB3D_CACHE_SAID")
+    monkeypatch.setenv("FB3D_CACHE_WARNED", "")  # so that it is as before in the end
+    monkeypatch.delenv("FB3D_CACHE_WARNED")
     with full_disk(1000):
         assert_same(load_object(folder), load_object(folder))
     assert len(parses) == 2
