@@ -96,7 +96,7 @@ class AlgoConfig:
 
 @dataclass
 class ArtFlowNetConfig(AlgoConfig):
-    """fb3d_rl.training.fit.FitOptions and the network's arguments, for every network that flow samples train.
+    """fb3d_rl.training.options.FitOptions and the network's arguments, for every network that flow samples train.
 
     Attributes:
         epochs: how often each training sample is drawn; with the batch size it gives the number of steps.

@@ -34,9 +34,12 @@ from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, git_revision, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, check_state, emulates_bf16, fit, require_compiler
+from fb3d_rl.training.device import emulates_bf16, require_compiler
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.options import FitOptions
 from fb3d_rl.training.processes import rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
+from fb3d_rl.training.state import check_state
 
 if TYPE_CHECKING:
     from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, TrainConfig

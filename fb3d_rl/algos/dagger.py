@@ -38,16 +38,21 @@ from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
-from fb3d_rl.rollout.collectors import Workers, steady_floats
+from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
 from fb3d_rl.rollout.trials import schedule
+from fb3d_rl.rollout.worker import steady_floats
 from fb3d_rl.scene.posed import Posed
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import FitOptions, Objective, check_state, fit, generator
+from fb3d_rl.training.draws import generator
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 from fb3d_rl.training.run_log import RunLog, open_logger
 from fb3d_rl.training.schedules import beta
+from fb3d_rl.training.state import check_state
 
 if TYPE_CHECKING:
     from fb3d_rl.config import EvaluateConfig, ImitationConfig, TrainConfig
@@ -57,7 +62,7 @@ ALGOS = ("bc", "dagger")
 # TorchRL 0.14.1 says so of its own BCLoss, in which it left out two annotations.
 warnings.filterwarnings("ignore", message="The name target_actor_network_params wasn't part")
 TURN = 4
-"""Purpose of random draws; see :func:`fb3d_rl.training.fit.generator`."""
+"""Purpose of random draws; see :func:`fb3d_rl.training.draws.generator`."""
 
 
 class Labels:

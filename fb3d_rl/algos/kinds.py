@@ -22,7 +22,8 @@ from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.policies.direction_policy import direction_policy
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, artflownet_policy
 from fb3d_rl.policies.hand import VelocityLimits
-from fb3d_rl.training.fit import FitOptions, Objective
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 
 Measure: TypeAlias = "Callable[[CloudNetwork, TensorDictBase, torch.device], dict[str, Tensor]]"
 """Numbers of samples [S], each [S], "cosine" among them: in validation the network with the largest is the best."""

@@ -10,7 +10,10 @@ from torch.nn import functional
 
 from fb3d_rl.kinematics.joint_screw import JointScrew, screw_of_flow
 from fb3d_rl.models.screwnet import ScrewNet
-from fb3d_rl.training.fit import FitOptions, Objective, augment, products_of
+from fb3d_rl.training.device import products_of
+from fb3d_rl.training.draws import augment
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase

@@ -10,7 +10,10 @@ from fb3d_rl.geometry.points import gather
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.models.direction_net import DirectionNet, SearchOptions, directions_at
-from fb3d_rl.training.fit import FitOptions, Objective, augment, generator, products_of
+from fb3d_rl.training.device import products_of
+from fb3d_rl.training.draws import augment, generator
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 
 CONTACTS = 16
 """Contact points that are drawn on the part of each cloud ..."""

@@ -140,6 +140,9 @@ class Trial:
         """Draws the cloud after so many control steps: one for each, so that a restored state sees the same again."""
         return np.random.default_rng([self.seed, step])
 
+    def __str__(self) -> str:
+        return f"object {self.object}, link {self.link}, seed {self.seed}"
+
 
 Start = Literal["reference", "closed", "random"]
 """How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""

@@ -46,7 +46,7 @@ KEYS: tuple[Key, ...] = (
     ("next", "observation", "attached"),
     ("next", "observation", "contact_force"),
 )
-"""What a row is made of."""
+"""The entries of the frames that a row is computed from."""
 
 
 def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
@@ -61,7 +61,7 @@ def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
 
 
 def limits_of(options: EnvOptions) -> VelocityLimits:
-    """What an action means to the gripper of a task."""
+    """The velocities that an action of 1 stands for in a task."""
     return VelocityLimits(options.gripper.v_max, options.gripper.w_max, 1.0 / options.control_freq)
 
 
@@ -77,9 +77,9 @@ def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
 
 
 class _PolicyEnv(TransformedEnv):
-    """Takes the groups of state that a policy wrote below "next", each of them whole, in place of the last step's.
+    """Replaces groups of state as a whole by those that a policy wrote below "next".
 
-    TorchRL would ask of each of their keys, twice in a step, whether it is among all the keys of the environment.
+    TorchRL would look up each of their keys among all keys of the environment twice in a step, which is slow.
     """
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -114,7 +114,7 @@ def run_trials(
     """Run every trial once.
 
     A trial that crashes, or whose policy takes too long, becomes a row with status "error" and counts as a failure;
-    the others are not touched by it. The rows do not depend on the backend and the number of workers.
+    it does not affect the others. The rows do not depend on the backend and the number of workers.
 
     Args:
         name: the policy's name in the rows.
@@ -176,7 +176,7 @@ def _row(episode: Episode, name: str, mask: str, item: Scheduled, options: EnvOp
 
 
 def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
-    """What a row says about the steps [T] of an episode."""
+    """The columns of a row that follow from the steps [T] of an episode."""
     after = frames["next"]
     attached = after["observation", "attached"].flatten()
     held = after["contact"].flatten().nonzero().flatten()

@@ -27,7 +27,8 @@ from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.rollout.rows import read_trials
 from fb3d_rl.scene.posed import Posed
-from fb3d_rl.training.fit import FitOptions, fit
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.options import FitOptions
 from fb3d_rl.training.run_log import RunLog, read_rows
 
 Config = Callable[[str, list[str]], Any]

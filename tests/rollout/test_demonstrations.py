@@ -199,7 +199,7 @@ def test_a_trajectory_file_that_record_episode_wrote_is_read(
     assert (info.steps, info.success) == (buffer.episodes[1].steps, buffer.episodes[1].success)
     with pytest.raises(UserError, match="from elsewhere"):
         trial_of(info)
-    with pytest.raises(UserError, match="does not tell how"):
+    with pytest.raises(UserError, match="does not say how"):
         recorded_options(read)
     with pytest.raises(UserError, match="--root"):
         recorded_object(read, 0)

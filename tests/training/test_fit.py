@@ -20,18 +20,11 @@ from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.scene.posed import Posed
-from fb3d_rl.training.fit import (
-    FitOptions,
-    augment,
-    batch_rows,
-    emulates_bf16,
-    fit,
-    flow_loss,
-    learning_rate,
-    require_compiler,
-    resident,
-    rotate_about_z,
-)
+from fb3d_rl.training.device import emulates_bf16, require_compiler, resident
+from fb3d_rl.training.draws import augment, batch_rows, rotate_about_z
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.objective import flow_loss
+from fb3d_rl.training.options import FitOptions, learning_rate
 
 
 def make_rows(rows: int = 6, points: int = 64) -> TensorDict:

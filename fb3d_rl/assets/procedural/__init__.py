@@ -1,6 +1,6 @@
 """Procedural articulated objects, written as PartNet-Mobility folders.
 
-They carry no third party's licence, so they are what the project trains on by default and what its tests use.
+No third party's licence applies to them, so they are what the project trains on by default and what its tests use.
 A family is a function from a random generator to an `ObjectSpec`; to add one, write the function and enter it
 in `FAMILIES`.
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
+from fb3d_rl.assets.procedural import appliances, frames, furniture, handheld, lidded
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
 from fb3d_rl.assets.splits import TRAIN_CATEGORIES
 from fb3d_rl.errors import UserError
@@ -23,13 +23,13 @@ from fb3d_rl.errors import UserError
 __all__ = ["FAMILIES", "ObjectSpec", "Part", "expand", "generate", "object_id", "sample"]
 
 FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
-    "StorageFurniture": cabinets.storage_furniture,
-    "Table": cabinets.table,
-    "Refrigerator": cabinets.refrigerator,
-    "Microwave": cabinets.microwave,
-    "Safe": cabinets.safe,
-    "Oven": cabinets.oven,
-    "Dishwasher": cabinets.dishwasher,
+    "StorageFurniture": furniture.storage_furniture,
+    "Table": furniture.table,
+    "Refrigerator": appliances.refrigerator,
+    "Microwave": appliances.microwave,
+    "Safe": appliances.safe,
+    "Oven": appliances.oven,
+    "Dishwasher": appliances.dishwasher,
     "WashingMachine": frames.washing_machine,
     "Door": frames.door,
     "Window": frames.window,
@@ -74,7 +74,7 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
 
 
 def expand(categories: Sequence[str]) -> list[str]:
-    """The names of families that words name: themselves, or "all", "train" or "test" (UMPNet's halves of them)."""
+    """The families that are listed; "all", "train" and "test" (UMPNet's categories) stand for several."""
     groups = {
         "all": list(FAMILIES),
         "train": [name for name in FAMILIES if name in TRAIN_CATEGORIES],
@@ -94,7 +94,7 @@ def check(categories: Sequence[str], count: int, seed: int) -> None:
         wrong = f"No procedural family for category {unknown[0]!r}" if unknown else "No category was named"
         raise UserError(f"{wrong}: choose among {', '.join(FAMILIES)}.")
     if count < 1:
-        raise UserError(f"{count} procedural objects per category were asked for: ask for at least 1.")
+        raise UserError(f"The number of procedural objects per category is {count}: give a number of at least 1.")
     if seed < 0:
         raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
 
