@@ -11,9 +11,10 @@ from fb3d_rl.geometry.points import knn, pca_curvature
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import uniform
+from fb3d_rl.policies.policy import Policy
 
 
-class RandomPolicy(TensorDictModuleBase):
+class RandomPolicy(Policy):
     """Actions that are uniform in [-1, 1] and depend on the trial's seed and the step alone; what luck opens.
 
     Shapes: reads the trial's "seed" and "elapsed_steps" [E, 1]; writes "action" [E, 8].

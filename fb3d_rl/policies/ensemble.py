@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from fb3d_rl.contract import Key
+from fb3d_rl.policies.policy import Policy, initial_state
 
 
-class Ensemble(TensorDictModuleBase):
+class Ensemble(Policy):
     """The mean action of M learners and their variance.
 
     "action" and what all members declare below "learner", such as a predicted discrepancy, are the members' means.
@@ -45,8 +46,7 @@ class Ensemble(TensorDictModuleBase):
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
         """The state that the members share, at the start of an episode; empty if they have none."""
-        start: Callable[[torch.Size], TensorDict] | None = getattr(self.members[0], "initial_state", None)
-        return TensorDict({}, batch_size=batch) if start is None else start(batch)
+        return initial_state(self.members[0], batch)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the means, the variance and the next state."""

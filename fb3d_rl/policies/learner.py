@@ -24,6 +24,7 @@ from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
+from fb3d_rl.policies.policy import Policy
 
 TWIST = 6
 """Tip velocity and turning of the hand in the world, each as a share of the gripper's limit."""
@@ -135,7 +136,7 @@ class TwistNetwork(nn.Module):
         return tuple(parts) if len(parts) > 1 else parts[0]
 
 
-class Learner(TensorDictModuleBase):
+class Learner(Policy):
     """A policy that imitates: cloud, hand and part mask -> velocities.
 
     It sees the cloud from the suction tip, in the world's axes, and says how the tip shall move and the hand turn
