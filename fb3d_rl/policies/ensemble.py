@@ -1,4 +1,4 @@
-"""Several learners as one policy, whose disagreement says how far it is from what it has learned."""
+"""Several learners as one policy, whose disagreement measures how far a state is from the training data."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Ensemble(Policy):
     as they are the whole ensemble), averaged over the entries: 1/(D M) sum_d sum_m (a_md - mean_d)^2. That is the
     novelty of ThriftyDAgger and, since actions are normalised, EnsembleDAgger's variance in one number.
 
-    Every member sees the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
+    Every member reads the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
     keep has to be one of the observation, such as the last actions: the first member writes it for all.
 
     Args:

@@ -33,9 +33,9 @@ class Gate(nn.Module):
         """Set the thresholds, if a budget sets them, by what the last round showed.
 
         Args:
-            frames: the steps [T] in which the gate had a say, with what it reads, its state and the two actions. What
+            frames: the steps [T] in which the gate decided, with what it reads, its state and the two actions. What
                 is below "learner" is best that of the learner as it is now.
-            budget: in which share of the steps that the learner would make the expert may take over, 0 to 1.
+            budget: share of the learner's steps in which the expert may take over, 0 to 1.
         """
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
