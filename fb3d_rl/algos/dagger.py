@@ -37,7 +37,7 @@ from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
 from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
-from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, turned
+from fb3d_rl.policies.learner import FLOW_KEYS, INPUTS, Learner, LearnerOptions, rotated
 from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
@@ -485,7 +485,7 @@ def imitation_objective(learner: Learner | Ensemble, algo: ImitationConfig, seed
         for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
             draws = torch.rand(2, len(rows), generator=generator(_nth(seed, "member", k), TURN, step)).to(rows.device)
             mirrored = (draws[1] < 0.5) & algo.mirror
-            inputs, twist = turned(member.look(rows), rows["twist"], (2 * draws[0] - 1) * most, mirrored)
+            inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * most, mirrored)
             inputs["twist"], inputs["is_pad"] = twist, rows["is_pad"]
             values.append(loss(inputs)["loss_bc"])
             if member.options.discrepancy:

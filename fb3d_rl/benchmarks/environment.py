@@ -67,7 +67,7 @@ def expert_episodes(objects: Sequence[ArticulatedObject], options: EnvOptions) -
     episodes = []
     for seed, obj in enumerate(objects):
         trial = default_trial(obj, seed=seed)
-        env = policy_env(make_env([obj], options, [trial]))
+        env = policy_env(make_env([obj], options, [trial]), state_of(expert))
         with torch.no_grad():
             frames = env.rollout(options.horizon, expert)
         episodes.append(Episode(trial, frames["action"].reshape(-1, frames["action"].shape[-1])))

@@ -27,10 +27,12 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.contact import Contact as Touch
 from fb3d_rl.policies.contact import choose_contact
-from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
+from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
+from fb3d_rl.policies.flow_state import APPROACH, PHASES, PULL, SELECT, TRAVEL
 from fb3d_rl.policies.hand import hand_axis
-from fb3d_rl.rollout.run import limits_of, policy_env
+from fb3d_rl.rollout.run import limits_of, policy_env, state_of
 from fb3d_rl.rollout.trials import schedule
 from fb3d_rl.scene.observer import observe
 from fb3d_rl.scene.posed import Posed
@@ -160,7 +162,7 @@ class Session:
             raise UserError(f"there is no {name} flow without a network; give its weights: checkpoint=PATH")
         self.flow = name
         self._policy = FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options)
-        self._picked: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._picked: tuple[Touch, Touch] | None = None
 
     def set_part(self, link: int) -> None:
         """Choose the part to open, with the joint state and the view that an evaluation would start from."""
@@ -243,14 +245,14 @@ class Session:
         others = torch.ones_like(obs["valid"])
         others[0, row] = False
         picked = self._choose(others)
-        if not torch.equal(picked[0][0], obs["points"][0, row]):
+        if not torch.equal(picked[0].point[0], obs["points"][0, row]):
             raise UserError(
                 f"the {self.flow} flow there is {float(norm[row]):.2f}, too little to pull along; "
                 "pick a point that moves"
             )
         self._picked = picked
         if self.trial is not None:
-            self._policy.send(self._frame["policy"], obs, picked)
+            self._policy.go_to(self._frame, *picked)
         self.moment = self._moment()
 
     # ------------------------------------------------------------------------------------------------- what is seen
@@ -300,7 +302,8 @@ class Session:
         """Where the policy touches, or would if it began now."""
         phase = SELECT if self.trial is None else PHASES.index(self.trial.phase)
         if phase == SELECT:
-            point, pull, standoff, _ = self._picked or self._choose()
+            touch = (self._picked or self._choose())[0]
+            point, pull, standoff = touch.point, touch.flow, touch.standoff
         elif phase in (TRAVEL, APPROACH, PULL):
             point, pull, standoff = (self._frame["policy", key] for key in ("contact_point", "pull", "standoff"))
             if phase == PULL:
@@ -314,7 +317,7 @@ class Session:
         obs = self._frame["observation"]
         return obs["valid"] if self._policy_options.mask == "none" else obs["valid"] & obs["part_mask"]
 
-    def _choose(self, avoid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _choose(self, avoid: Tensor | None = None) -> tuple[Touch, Touch]:
         """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
         obs, options = self._frame["observation"], self._policy_options.contact
         shown = self._shown()
@@ -358,11 +361,11 @@ class Session:
         require_simulator("look at flow and contact points alone")
         if self._base is None or self._env is None:
             self._base = make_env([self.obj], self._env_options)
-            self._env = policy_env(self._base)
+            self._env = policy_env(self._base, state_of(self._policy))
         self._base.set_trials([self._trial])
         frame = self._env.reset()
         if self._picked is not None:
-            self._policy.send(frame["policy"], frame["observation"], self._picked)
+            self._policy.go_to(frame, *self._picked)
         self._seen(frame, False)
 
     def _seen(self, frame: TensorDictBase, over: bool) -> None:

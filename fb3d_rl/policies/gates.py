@@ -1,7 +1,7 @@
 """The gates of interactive imitation: when the expert takes over from the learner and hands back.
 
 Distances between actions are ||a_learner - a_expert|| over the D entries of normalised actions (the papers partly write
-its square). Wherever a gate compares a number of the learner's that is not finite, the expert acts.
+its square). Where a number of the learner that a gate compares is not finite, the expert acts.
 """
 
 from __future__ import annotations

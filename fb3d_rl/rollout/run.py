@@ -18,8 +18,9 @@ from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.policies.flow_policy import MASK, FlowPolicy
+from fb3d_rl.policies.flow_policy import MASK
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.policy import initial_state
 from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers
 from fb3d_rl.rollout.decisions import DECISION, TimedPolicy, TookTooLong
 from fb3d_rl.rollout.rows import (
@@ -49,15 +50,9 @@ KEYS: tuple[Key, ...] = (
 """The entries of the frames that a row is computed from."""
 
 
-def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
-    """What travels in the TensorDicts [1] of an episode at its start, all 0.
-
-    That is the flow policy's state below "policy", and what else ``policy.initial_state`` lays out.
-    """
-    one = torch.Size([1])
-    start = TensorDict({"policy": FlowPolicy.initial_state(one)}, batch_size=one)
-    further = None if isinstance(policy, FlowPolicy) else getattr(policy, "initial_state", None)
-    return start if further is None else start.update(further(one))
+def state_of(policy: TensorDictModuleBase) -> TensorDict:
+    """The policy's state in the TensorDicts [1] of an episode at its start, all zeros."""
+    return initial_state(policy, torch.Size([1]))
 
 
 def limits_of(options: EnvOptions) -> VelocityLimits:
@@ -65,15 +60,10 @@ def limits_of(options: EnvOptions) -> VelocityLimits:
     return VelocityLimits(options.gripper.v_max, options.gripper.w_max, 1.0 / options.control_freq)
 
 
-def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
-    """``env`` with a policy's state in its TensorDicts, set to 0 at every reset.
-
-    Args:
-        env: the environment.
-        state: as :func:`state_of` gives it; the flow policy's alone unless given.
-    """
-    start = (state_of() if state is None else state).expand(env.batch_size)
-    return _PolicyEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
+def policy_env(env: EnvBase, state: TensorDictBase) -> EnvBase:
+    """``env`` with a policy's state, as :func:`state_of` gives it, in its TensorDicts, set to 0 at every reset."""
+    start = _specs_of(state.expand(env.batch_size))
+    return _PolicyEnv(env, TensorDictPrimer(start, default_value=0.0))
 
 
 class _PolicyEnv(TransformedEnv):
