@@ -26,8 +26,9 @@ from omegaconf.errors import OmegaConfBaseException
 from fb3d_rl import interrupt
 from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
 from fb3d_rl.errors import Interrupted, UserError, of_disk
+from fb3d_rl.places import folder
 
-CONF = str(Path(__file__).resolve().parents[1] / "conf")
+CONF = str(folder("conf"))
 SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig | ViewConfig]] = {
     "train": TrainConfig,
     "evaluate": EvaluateConfig,
