@@ -15,6 +15,7 @@ import torch
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.partnet_mobility import load_object
@@ -311,7 +312,7 @@ def test_the_way_is_the_one_that_geometry_leaves(mechanisms: Objects) -> None:
     """A button is at the bottom of its hole when it is pressed; a cap or lid the other way goes into the body."""
     for path, body, movable in mechanisms:
         for link in movable:
-            if link.semantic == "slider button":
+            if link.semantic in ("slider button", "slider pump_lid"):
                 assert gap(body, link, link.limits[1] + 0.05) < 0, path.name
             elif path.name.split("-")[1] in ("FlipCap", "PullCap"):
                 assert gap(body, link, -0.05) < 0, path.name
@@ -322,7 +323,7 @@ def test_all_parts_of_mechanisms_open(mechanisms: Objects) -> None:
     for path, _, movable in mechanisms:
         assert 1 <= len(movable) <= 4
         obj = load_object(path)
-        assert openable_links(obj) == obj.movable, path.name
+        assert openable_links(obj) == list(obj.movable), path.name
         for closed, opened, limits in zip(*opening_range(obj), obj.limits, strict=True):
             assert (closed, opened) == tuple(limits) and closed == 0
             assert opened < 4
@@ -331,8 +332,9 @@ def test_all_parts_of_mechanisms_open(mechanisms: Objects) -> None:
             assert np.linalg.norm(link.axis) == pytest.approx(1, abs=1e-5)
             if path.name.split("-")[1] in ("Knob", "TwistCap", "Wheel"):  # they turn on the spot
                 points = np.concatenate([mesh.vertices for mesh in link.meshes])
-                arms = np.linalg.norm(np.cross(points - link.origin, link.axis), axis=1)
-                assert arms.min() < 0.5 * arms.max(), path.name
+                spots = np.vstack([points, (points.min(0) + points.max(0)) / 2]) - link.origin
+                arms = np.linalg.norm(np.cross(spots, link.axis), axis=1)
+                assert arms[-1] < 0.7 * arms.max(), path.name
 
 
 def test_doors_that_look_alike_open_in_four_ways(tmp_path: Path) -> None:
@@ -350,12 +352,16 @@ def test_doors_that_look_alike_open_in_four_ways(tmp_path: Path) -> None:
             clouds.append(np.column_stack([cloud, links]))
             flows.append(flow.numpy()[links == door.movable[0]])
             hinges.append(poses[door.movable[0], :2, 3].numpy())
-        has_handle = any(piece.name == "handle" for piece in sample("AmbiguousDoor", 7, group).parts[0].pieces)
+        specs = [sample("AmbiguousDoor", 7, group + k) for k in range(4)]
+        pieces = [[*spec.body, *spec.parts[0].pieces] for spec in specs]
+        shapes = [np.concatenate([piece.vertices for piece in each]) for each in pieces]
+        has_handle = any(piece.name == "handle" for piece in pieces[0])
         for a, b in itertools.combinations(range(4), 2):
-            if not has_handle or a // 2 == b // 2:
-                np.testing.assert_array_equal(clouds[a], clouds[b])
-            elif has_handle:
-                assert clouds[a].shape != clouds[b].shape or np.abs(clouds[a] - clouds[b]).max() > 0.01
+            alike = not has_handle or a // 2 == b // 2
+            assert np.array_equal(shapes[a], shapes[b]) == alike
+            # Links have frames of their own, so a ray along an edge may hit one and miss the other by a rounding.
+            distance, _ = cKDTree(clouds[a]).query(clouds[b])
+            assert not alike or (distance < 1e-4).mean() > 0.99
         # The front is at -x: two are pulled there, two are pushed away, about hinges on either side.
         assert [flow[:, 0].mean() < 0 for flow in flows] == [True, False, True, False]
         assert len({round(float(hinge[1]), 3) for hinge in hinges}) == 2

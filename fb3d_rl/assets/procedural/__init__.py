@@ -54,6 +54,7 @@ MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "ControlPanel": controls.control_panel,
     "PullCap": caps.pull_cap,
     "TwistCap": caps.twist_cap,
+    "PumpCap": caps.pump_cap,
     "FlipCap": caps.flip_cap,
     "FoldingBlade": folding.folding_blade,
     "FoldingLeg": folding.folding_leg,

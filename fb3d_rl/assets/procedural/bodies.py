@@ -18,7 +18,7 @@ from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 Half = tuple[float, float]
 """Half sizes of a rectangle along x and y, m."""
-FRONT_YAW = 1.3
+FRONT_YAW = 1.15
 """How far (rad) an object is turned at most whose parts are in front: farther, and a camera before it sees none."""
 
 
@@ -126,12 +126,14 @@ class Body:
         mount: The pose of the mount.
         half: The half sizes of the mount's rectangle, m.
         pitch: The mount's angle, rad: 0 in front, pi / 2 on top.
+        radius: Of the circle around the mount's rectangle that is the body's outline, m; 0 unless it is a cylinder.
     """
 
     pieces: tuple[Piece, ...]
     mount: Pose
     half: Half
     pitch: float
+    radius: float = 0.0
 
     def object(
         self, category: str, rng: np.random.Generator, fixed: Iterable[Piece], parts: Iterable[Part]
@@ -153,7 +155,7 @@ def draw_body(rng: np.random.Generator, top: float = 0.35, slanted: float = 0.2,
     """
     kind = rng.choice(["top", "slanted", "front"], p=[top, slanted, 1 - top - slanted])
     # Sizes in the mount's frame: along x, along y, and how deep the body reaches behind the mount.
-    half, deep = (log_uniform(rng, 0.3, 0.9), log_uniform(rng, 0.3, 0.9)), log_uniform(rng, 0.15, 1.6)
+    half, deep = (log_uniform(rng, 0.3, 0.9), log_uniform(rng, 0.3, 0.9)), log_uniform(rng, 0.12, 1.3)
     if is_round := bool(kind != "slanted" and rng.random() < round_share):
         half = (half[0], half[0])
     scale = 1.9 / float(np.linalg.norm([2 * half[0], 2 * half[1], deep]))
@@ -166,7 +168,7 @@ def draw_body(rng: np.random.Generator, top: float = 0.35, slanted: float = 0.2,
     mount = pitch(angle)
     pieces = list(mount.pieces(local))
     pieces += _extras(rng, half, deep, kind == "top", low, is_round)
-    return Body(tuple(pieces), mount, inside, angle)
+    return Body(tuple(pieces), mount, inside, angle, half[0] if is_round else 0.0)
 
 
 def _core(rng: np.random.Generator, half: Half, deep: float, is_round: bool) -> tuple[list[Piece], Half]:

@@ -1,4 +1,4 @@
-"""Families of vessels and cases whose cap is pulled off, twisted or flipped open."""
+"""Families of vessels and cases whose cap is pulled off, twisted, pressed or flipped open."""
 
 from __future__ import annotations
 
@@ -40,6 +40,34 @@ def twist_cap(rng: np.random.Generator) -> ObjectSpec:
     return _laid(rng, ObjectSpec("TwistCap", "free", "body", tuple(pieces), (part,)))
 
 
+def pump_cap(rng: np.random.Generator) -> ObjectSpec:
+    """A bottle or dispenser whose head, with or without a spout, stands out of a collar and is pressed down."""
+    pieces, neck, mouth, _ = _vessel(rng)
+    travel, tall = rng.uniform(0.06, 0.3), rng.uniform(0.05, 0.15)
+    stem = max(rng.uniform(0.3, 0.6) * neck, 0.02)
+    inner = (stem + CLEAR) / float(np.cos(np.pi / SIDES))
+    outer = inner + rng.uniform(0.02, 0.06)
+    # The stem's lower end goes down in the collar, as far as the collar's floor leaves it.
+    top = mouth + travel + CLEAR + tall
+    rim = circle(SIDES)
+    pieces += wall("collar", rim, (mouth, top), (outer, outer), (outer, outer), outer - inner)
+    pieces.append(rod("collar", (0, mouth - 0.03, 0), (0, mouth, 0), max(outer, neck) + 0.02, sides=SIDES))
+    under = top + travel + CLEAR
+    head, high = max(rng.uniform(0.8, 1.6) * outer, 0.06), rng.uniform(0.05, 0.15)
+    lid = [
+        rod("pump", (0, mouth + travel + CLEAR, 0), (0, under + 0.01, 0), stem, sides=SIDES),
+        rod("pump", (0, under, 0), (0, under + high, 0), head, rng.uniform(0.7, 1.0) * head, sides=SIDES),
+    ]
+    if rng.random() < 0.7:
+        out, thin = head + rng.uniform(0.1, 0.5), 0.4 * high
+        lid.append(
+            rod("spout", (0, under + 0.5 * high, 0), (0, under + rng.uniform(0.4, 0.6) * high, out), thin, 0.7 * thin)
+        )
+    part = Part("pump_lid", "slider", (0, -1, 0), travel, tuple(lid))
+    spec = ObjectSpec("PumpCap", "free", "body", tuple(pieces), (part,))
+    return yaw(rng.uniform(-np.pi, np.pi)).spec(spec)
+
+
 def flip_cap(rng: np.random.Generator) -> ObjectSpec:
     """A body whose lid, thin or as tall as a lighter's, is hinged at one edge and flips open, on top or in front."""
     body = draw_body(rng, top=0.6, slanted=0.1, round_share=0.2)
@@ -51,9 +79,15 @@ def flip_cap(rng: np.random.Generator) -> ObjectSpec:
     across, along = half if turns % 2 == 0 else half[::-1]
     sheet = rng.uniform(0.02, 0.08) if rng.random() < 0.65 else rng.uniform(0.1, 0.45)
     z = (CLEAR, CLEAR + sheet)
-    pieces = [box("lid_surface", (-across, across), (-along, along), z)]
+    if full and body.radius:
+        across = along = body.radius
+        pieces = [
+            rod("lid_surface", (0, 0, z[0]), (0, 0, z[1]), body.radius, rng.uniform(0.8, 1.0) * body.radius, SIDES)
+        ]
+    else:
+        pieces = [box("lid_surface", (-across, across), (-along, along), z)]
     if rng.random() < 0.25:
-        size = (rng.uniform(0.5, 0.8) * across, rng.uniform(0.5, 0.8) * along)
+        size = (rng.uniform(0.35, 0.55) * across, rng.uniform(0.35, 0.55) * along)
         pieces.append(
             box("lid_field", (-size[0], size[0]), (-size[1], size[1]), (z[1], z[1] + rng.uniform(0.01, 0.05)))
         )
@@ -71,7 +105,7 @@ def flip_cap(rng: np.random.Generator) -> ObjectSpec:
     return body.object("FlipCap", rng, (), [Pose(quarter(turns).turn, (*middle, 0.0)).part(part)])
 
 
-def _lathe(rng: np.random.Generator, name: str, outline: np.ndarray, profile: list[tuple[float, float]]) -> list[Piece]:
+def _lathe(name: str, outline: np.ndarray, profile: list[tuple[float, float]]) -> list[Piece]:
     """Frusta of one outline [n, 2] between the (radius, height) of a profile."""
     return [
         loft(name, level(outline, (r0, r0), y0), level(outline, (r1, r1), y1))
@@ -99,10 +133,10 @@ def _vessel(rng: np.random.Generator) -> tuple[list[Piece], float, float, float]
         (radius, rng.uniform(0.2, 0.7) * height),
         (rng.uniform(0.8, 1.0) * radius, height),
     ]
-    pieces = _lathe(rng, "body", outline, profile)
+    pieces = _lathe("body", outline, profile)
     if collar > height + 0.01:
         least = neck / float(np.abs(outline).max(0).min()) if flat else neck
-        pieces += _lathe(rng, "shoulder", outline, [(profile[-1][0], height), (1.02 * least, collar)])
+        pieces += _lathe("shoulder", outline, [(profile[-1][0], height), (1.02 * least, collar)])
     pieces.append(rod("neck", (0, collar - 0.01, 0), (0, mouth, 0), neck, sides=SIDES))
     if rng.random() < 0.15 and not slim:  # a mug's or a can's handle
         out = radius + rng.uniform(0.12, 0.3)

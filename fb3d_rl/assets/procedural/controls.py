@@ -25,7 +25,7 @@ from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
 
 CLEAR = 0.007
 """Gap (m) between what moves and what does not, in a body about 2 m across."""
-SMALLEST = 0.14
+SMALLEST = 0.22
 """Least half side (m) of a cell: a control in a smaller one is hardly seen."""
 
 
@@ -89,7 +89,7 @@ def _panel(
     columns, rows = min(options, key=lambda grid: abs(np.log(half[0] / grid[0] / (half[1] / grid[1]))))
     columns, rows = (max(1, min(n, int(h / SMALLEST))) for n, h in zip((columns, rows), half, strict=True))
     cell_half = (half[0] / columns, half[1] / rows)
-    thick = rng.uniform(0.07, 0.16)
+    thick = rng.uniform(0.08, 0.18)
     kinds = [cells[k] for k in rng.permutation(len(cells))]
     if not mixed:
         kinds = kinds[:1]
@@ -183,10 +183,11 @@ def _stick_cell(rng: np.random.Generator, half: Half, thick: float) -> Cell:
     """A stick in a slot that tips from one end of it to the other."""
     turns = _mostly_down(rng)
     across, along = half if turns % 2 == 0 else half[::-1]
-    radius = min(rng.uniform(0.03, 0.07), 0.35 * thick, 0.5 * across)
+    radius = min(rng.uniform(0.035, 0.08), 0.37 * thick, 0.5 * across)
     pivot = 0.5 * thick
-    upper, share, length = rng.uniform(0.8, 1.3), rng.uniform(0.4, 0.6), thick + rng.uniform(0.2, 0.6)
-    grip = rng.uniform(1.1, 1.8) * radius if rng.random() < 0.5 else radius
+    upper, share, length = rng.uniform(0.8, 1.3), rng.uniform(0.4, 0.6), thick + rng.uniform(0.25, 0.7)
+    tip, is_grip = rng.uniform(1.2, 2.0) * radius, rng.random() < 0.5
+    grip = rng.uniform(1.2, 1.6) * tip if is_grip else tip
     # Neither at the slot's ends nor at its tip does it leave its cell: in a small one it tips less far.
     while True:
         lean = max(share, 1 - share) * upper
@@ -199,9 +200,11 @@ def _stick_cell(rng: np.random.Generator, half: Half, thick: float) -> Cell:
     plate = holed("panel", (across, along), (1.1 * radius + CLEAR, reach + CLEAR), (0.0, thick))
     axis = np.array([0.0, np.sin(tilt), np.cos(tilt)])
     start, low, end = (tuple((np.array([0, 0, pivot]) + at * axis).tolist()) for at in (0.0, 0.8 * length, length))
-    pieces = [rod("lever", start, end, 0.8 * radius, radius)]
+    # It gets wider towards its tip, but not in the slot.
+    tip = min(tip, (0.8 + 0.3 * cosine * length / (thick - pivot)) * radius)
+    pieces = [rod("lever", start, end, 0.8 * radius, tip)]
     room = (0.8 * length * cosine + pivot - thick - 2 * CLEAR) / max(sine, 0.1)  # of a grip above the plate
-    if radius < min(grip, room):
+    if is_grip and tip < min(grip, room):
         pieces.append(rod("handle", low, end, min(grip, room)))
     part = Part("lever", "hinge", (1, 0, 0), upper, tuple(pieces), (0, 0, pivot))
     return _turned(Cell(plate, part), turns)
@@ -210,8 +213,8 @@ def _stick_cell(rng: np.random.Generator, half: Half, thick: float) -> Cell:
 def _arm_cell(rng: np.random.Generator, half: Half, thick: float) -> Cell:
     """An arm on a hub that turns about the surface's normal."""
     length = rng.uniform(0.75, 0.97) * min(half)
-    hub, high = rng.uniform(0.12, 0.3) * length, rng.uniform(0.04, 0.2)
-    wide, sheet = rng.uniform(0.4, 0.9) * hub, rng.uniform(0.03, 0.06)
+    hub, high = rng.uniform(0.18, 0.35) * length, rng.uniform(0.04, 0.2)
+    wide, sheet = rng.uniform(0.5, 0.9) * hub, min(rng.uniform(0.03, 0.06), high)
     base = thick + CLEAR
     z = (base + high - sheet, base + high)
     reach = float(np.sqrt(length**2 - wide**2))
@@ -238,16 +241,16 @@ def _slider_cell(rng: np.random.Generator, half: Half, thick: float) -> Cell:
     """A cap on a stem in a slot, which slides from one end to the other."""
     turns = _mostly_down(rng)
     across, along = half if turns % 2 == 0 else half[::-1]
-    slot = (min(rng.uniform(0.025, 0.06), 0.5 * across), rng.uniform(0.75, 0.95) * along)
-    tall = rng.uniform(0.15, 0.4) * slot[1]  # half the stem's extent along the slot
-    cap = (rng.uniform(1.2, 2.5) * slot[0], rng.uniform(0.9, 1.2) * tall)
+    slot = (min(rng.uniform(0.03, 0.07), 0.5 * across), rng.uniform(0.75, 0.95) * along)
+    tall = rng.uniform(0.2, 0.45) * slot[1]  # half the stem's extent along the slot
+    cap = (rng.uniform(1.5, 3.5) * slot[0], rng.uniform(0.9, 1.2) * tall)
     if rng.random() < 0.3:  # a toaster's lever
         cap = (rng.uniform(0.5, 0.9) * across, rng.uniform(0.5, 0.9) * tall)
     cap = (min(cap[0], 0.95 * across), min(cap[1], tall + 0.03 * along))
     travel = 2 * (slot[1] - tall - CLEAR) * rng.uniform(0.75, 1.0)
     start = slot[1] - tall - CLEAR
     under = thick + CLEAR
-    top = under + rng.uniform(0.04, 0.2)
+    top = under + rng.uniform(0.05, 0.25)
     stem = slot[0] - CLEAR
     pieces = [
         box("stem", (-stem, stem), (start - tall, start + tall), (CLEAR, under + 0.005)),

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural.bodies import Pose, any_yaw, holed, pitch, ring, yaw
+from fb3d_rl.assets.procedural.bodies import any_yaw, holed, pitch, ring, yaw
 from fb3d_rl.assets.procedural.controls import CLEAR
 from fb3d_rl.assets.procedural.shapes import Piece, box, housing, rod
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
@@ -32,10 +31,7 @@ def _suitcase(rng: np.random.Generator) -> ObjectSpec:
     ]
     edges = [-half[0], -spread - hole, -spread + hole, spread - hole, spread + hole, half[0]]
     body += [box("body", pair, (at - hole, at + hole), z) for pair in zip(edges[::2], edges[1::2], strict=True)]
-    shell = Pose(Rotation.from_rotvec([0.0, 0.0, 0.0])).pieces(
-        housing((-half[0], half[0]), (-half[1], half[1]), (-tall, -sheet), sheet)
-    )
-    body += shell
+    body += housing((-half[0], half[0]), (-half[1], half[1]), (-tall, -sheet), sheet)
     if rng.random() < 0.5:
         x, y = 0.85 * half[0], 0.8 * half[1]
         body += [
