@@ -24,8 +24,8 @@ class AssetsConfig:
             file of such words (.txt, .json), or a list of them.
         eval_split: what train.py evaluates on, likewise.
         split_file: split file in UMPNet's format; if null, root/split-full.json, else UMPNet's own lists.
-        categories: families of procedural objects, or "all", "train" or "test" for UMPNet's; with "partnet_mobility",
-            those that are trained on besides.
+        categories: families of procedural objects; "all", "train" or "test" for UMPNet's, "mechanisms"; with
+            "partnet_mobility", those that are trained on besides.
         unseen_categories: families of procedural objects that are only evaluated on, as the split "test".
         train_count: procedural training objects of each category.
         eval_count: procedural held-out objects of each category; with "partnet_mobility" 0, or the splits
