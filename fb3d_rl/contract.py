@@ -12,8 +12,6 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 
-UNTRAINED = ("expert", "random", "normal")
-"""Policies that need no checkpoint."""
 ACTION_DIM = 8
 """x y z, roll pitch yaw, two fingers (supplement, II.C)."""
 

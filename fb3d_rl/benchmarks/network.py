@@ -30,7 +30,8 @@ from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import BACKBONES
-from fb3d_rl.training.fit import PRECISIONS, flow_loss, tune_cpu
+from fb3d_rl.training.fit import flow_loss, tune_cpu
+from fb3d_rl.training.options import PRECISIONS
 
 PEER = ("torch-geometric==2.7.0", "torch-cluster==1.6.3")
 """Later versions of PyTorch Geometric no longer call torch-cluster."""

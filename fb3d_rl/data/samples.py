@@ -2,43 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
-from fb3d_rl.camera.views import View, ViewRange
+from fb3d_rl.camera.options import CameraOptions
+from fb3d_rl.camera.raycast import RaycastCamera
+from fb3d_rl.camera.views import View
+from fb3d_rl.data.options import SampleOptions
 from fb3d_rl.flow.articulation_flow import articulation_flow, normalize_flow
 from fb3d_rl.kinematics.opening import openable_links, opening_range, standing_pose
 from fb3d_rl.kinematics.tree import KinematicTree
 from fb3d_rl.perception.cloud import MIN_VISIBLE, sample_cloud
-
-
-@dataclass(frozen=True)
-class SampleOptions:
-    """How samples are drawn.
-
-    Attributes:
-        points: N, points of a cloud.
-        views: ranges of the viewpoint.
-        camera: the camera's optics.
-        closed_share: share of samples whose target part is exactly closed; the others are uniform over its range.
-        others_closed: probability that each other joint is closed rather than uniform over its range.
-        all_parts_share: share of samples whose target is all movable parts (the reference's target), mask included.
-        some_parts_share: share of samples whose target is a part and a random choice of the other movable ones.
-    """
-
-    points: int = 1200
-    views: ViewRange = ViewRange()
-    camera: CameraOptions = CameraOptions()
-    closed_share: float = 0.3
-    others_closed: float = 0.7
-    all_parts_share: float = 0.3
-    some_parts_share: float = 0.0
 
 
 class ObjectView:

@@ -46,7 +46,7 @@ from rich.table import Table
 from scipy.special import betaincinv, stdtrit
 from scipy.stats import norm
 
-from fb3d_rl.contract import UNTRAINED
+from fb3d_rl.registry import untrained
 from fb3d_rl.rollout.rows import FlowRow, TrialRow, own_policy, policies
 
 LEVEL = 0.95
@@ -370,7 +370,7 @@ def has_flow(numbers: Mapping[str, Any]) -> bool:
 
 def trainings(numbers: Mapping[str, Any]) -> str:
     """How many trainings stand behind a run's summary, for people; nothing where no policy was trained."""
-    if not has_flow(numbers) and {*policies_of(numbers)} <= {*UNTRAINED}:
+    if not has_flow(numbers) and {*policies_of(numbers)} <= {*untrained()}:
         return ""
     return (
         "One training (one seed) stands behind each trained policy: intervals tell what other objects would change, "
