@@ -2,39 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.camera.views import ViewRange
+from fb3d_rl.data.options import SampleOptions
 from fb3d_rl.scene.observer import TRIES, Cloud, observe
 from fb3d_rl.scene.posed import Posed
-
-
-@dataclass(frozen=True)
-class SampleOptions:
-    """How samples are drawn.
-
-    Attributes:
-        points: N, points of a cloud.
-        views: ranges of the viewpoint.
-        camera: the camera's optics.
-        closed_share: share of samples whose target part is exactly closed; the others are uniform over its range.
-        others_closed: probability that each other joint is closed rather than uniform over its range.
-        all_parts_share: share of samples whose target is all movable parts (the reference's target), mask included.
-        some_parts_share: share of samples whose target is a part and a random choice of the other movable ones.
-    """
-
-    points: int = 1200
-    views: ViewRange = ViewRange()
-    camera: CameraOptions = CameraOptions()
-    closed_share: float = 0.3
-    others_closed: float = 0.7
-    all_parts_share: float = 0.3
-    some_parts_share: float = 0.0
 
 
 def flow_sample(cloud: Cloud, *targets: int) -> TensorDict:

@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from fb3d_rl.evaluation.intervals import UNBOUNDED, UNIT, Interval, Means, means
+from fb3d_rl.registry import untrained
 from fb3d_rl.rollout.rows import FlowRow, TrialRow, own_policy, policies
-from fb3d_rl.settings import UNTRAINED
 
 _POSITIVE: Interval = (0.0, math.inf)
 
@@ -236,7 +236,7 @@ def has_flow(numbers: Mapping[str, Any]) -> bool:
 
 def trainings(numbers: Mapping[str, Any]) -> str:
     """How many trainings stand behind a run's summary, for people; nothing where no policy was trained."""
-    if not has_flow(numbers) and {*policies_of(numbers)} <= {*UNTRAINED}:
+    if not has_flow(numbers) and {*policies_of(numbers)} <= {*untrained()}:
         return ""
     return (
         "One training (one seed) stands behind each trained policy: intervals tell what other objects would change, "

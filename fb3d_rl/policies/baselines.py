@@ -58,6 +58,11 @@ class NormalFlow(TensorDictModuleBase):
         return tensordict
 
 
+def random_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> RandomPolicy:
+    """What luck opens; limits and options say nothing to it."""
+    return RandomPolicy()
+
+
 def normal_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> TensorDictSequential:
     """The flow policy fed with surface normals.
 

@@ -25,6 +25,7 @@ from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion, screw
 from fb3d_rl.geometry.transforms import normalize
+from fb3d_rl.policies.options import ContactOptions
 
 CANDIDATES = 64
 """Points of a cloud that are remembered as candidates."""
@@ -58,54 +59,6 @@ class Contact(TensorClass):
         """Of the candidates of each cloud the one at ``index`` [B]."""
         rows = torch.arange(len(index), device=index.device)
         return self.apply(lambda x: x[rows, index])
-
-
-@dataclass(frozen=True)
-class ContactOptions:
-    """Thresholds of the contact-point heuristic.
-
-    Attributes:
-        neighbors: points that make a neighbourhood.
-        curvature: PCA curvature above which a point is no good place for a suction cup.
-        rim: a point whose neighbours on the part lie to one side is on its rim: largest distance from the point to
-            their mean, as a share of their mean distance.
-        min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
-        min_flow: share of the cloud's largest flow that a contact point must have.
-        near: what a metre from the hand counts against a point, in shares of the largest flow. The larger, the
-            more the choice depends on where the hand is, and the less on which points the camera happens to see; with
-            0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
-        turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
-        facing: cosine between flow and surface normal below which the hand approaches along the normal.
-        collisions: whether the hand's way to the point, and with the part from there, has to be free of the cloud and
-            the ground. Without it the supplement's rule is left: what is flat is good.
-        hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
-        clearance: where that cylinder starts, in front of the point, m.
-        reach: where that cylinder ends, m.
-        run_up: straight way (m) that the tip needs above the ground before it touches.
-        weak_flow: share of the largest flow that does if no point with more can be moved freely.
-        candidates: points whose way along the flow is checked.
-        sweep: how far along its way a point has to be free, m; ``sweep_angle`` (rad) if that is less.
-        sweep_steps: places along the way that are checked.
-    """
-
-    neighbors: int = 12
-    curvature: float = 0.03
-    rim: float = 0.45
-    min_distance: float = 0.02
-    min_flow: float = 0.5
-    near: float = 10.0
-    turning: float = 1.0
-    facing: float = 0.35
-    collisions: bool = True
-    hand_radius: float = 0.055
-    clearance: float = 0.06
-    reach: float = 0.6
-    run_up: float = 0.1
-    weak_flow: float = 0.1
-    candidates: int = 64
-    sweep: float = 1.0
-    sweep_angle: float = 1.6
-    sweep_steps: int = 8
 
 
 def choose_contact(

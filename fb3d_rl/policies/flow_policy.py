@@ -31,96 +31,25 @@ becomes SELECT without a choice: the hand stays. ::
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
-from typing import Literal
+from dataclasses import fields
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
-from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import alignment
 from fb3d_rl.models.artflownet import artflownet_module, reads_mask
 from fb3d_rl.policies.commands import above_ground, command
-from fb3d_rl.policies.contact import Contact, ContactOptions, best_candidate
+from fb3d_rl.policies.contact import Contact, best_candidate
 from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
+from fb3d_rl.policies.options import FlowPolicyOptions
 from fb3d_rl.policies.policy import Policy
 from fb3d_rl.policies.transitions import advance
 
 MASK = ("observation", "part_mask")
 """Where the mask of the part to open is read."""
-
-
-@dataclass(frozen=True)
-class FlowPolicyOptions:
-    """Speeds, gains, distances and times of the flow policy.
-
-    Attributes:
-        travel_speed: of the tip around the object, m/s.
-        approach_speed: of the tip on the way to the pre-contact point, m/s.
-        touch_speed: of the tip from there on (guarded), m/s.
-        pull_speed: factor that turns the normalised flow into a tip velocity (I.G), m/s.
-        angular_gain: factor that turns the rotation q_diff into an angular velocity (I.G), 1/s.
-        precontact: distance (m) of the pre-contact point in front of the contact point (I.G).
-        line: how far (m) off the approach line the tip may be when it turns to the contact point.
-        overshoot: how far (m) the tip may pass the contact point before the approach has failed.
-        force: contact force (N) that ends an approach which does not hold.
-        patience: how long (s) that force is borne, since suction may still engage.
-        stuck_speed: a pull is stuck if the tip moves slower (m/s) along the flow than this ...
-        stuck_time: ... for longer (s) than this: the hand tears itself off and tries elsewhere.
-        release_time: how long (s) it tries to tear itself off before it pulls on.
-        fade: share of the way behind it that still counts a twentieth of a second later where it has to go back.
-        retries: how often it chooses another contact point after it has missed one or lost hold; then it stays where it
-            is. None: as often as there is time.
-        retry_distance: points nearer (m) than this to a point tried in vain are not tried.
-        nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
-        lead: how far ahead of the observation the flow is read along the part's motion, as a share of a control step:
-            half of it, so that the tip moves on the chord of its arc and does not drift outwards.
-        clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
-            between itself and the ground z = 0.
-        funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
-        free: distance (m) from the visible points at which a straight way to the approach line is free.
-        margin: distance (m) that the tip keeps from the object's bounding sphere where the straight way is not free.
-        mask: which points the policy is told to act on: "target", those of the part to open, or "none": whatever has a
-            flow (the paper's "without mask").
-        contact: how a contact point is chosen.
-    """
-
-    travel_speed: float = 1.8
-    approach_speed: float = 1.6
-    touch_speed: float = 0.3
-    pull_speed: float = 0.8
-    angular_gain: float = 8.0
-    precontact: float = 0.1
-    line: float = 0.06
-    overshoot: float = 0.08
-    force: float = 20.0
-    patience: float = 0.2
-    stuck_speed: float = 0.08
-    stuck_time: float = 0.3
-    release_time: float = 0.9
-    fade: float = 0.8
-    retries: int | None = None
-    retry_distance: float = 0.08
-    nearby: float = 0.1
-    lead: float = 0.5
-    clearance: float = 0.07
-    funnel: float = 0.5
-    free: float = 0.08
-    margin: float = 0.1
-    mask: Literal["target", "none"] = "target"
-    contact: ContactOptions = field(default_factory=ContactOptions)
-
-    def require_mask(self, what: str) -> None:
-        """Check that the policy is shown the part to open.
-
-        Raises:
-            UserError: it is not, and ``what`` cannot do without.
-        """
-        if self.mask != "target":
-            raise UserError(f"{what} has to see which part to open: leave policy.mask=target")
 
 
 class FlowPolicy(Policy):

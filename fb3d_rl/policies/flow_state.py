@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 from tensordict import TensorClass, TensorDict, TensorDictBase
@@ -12,9 +12,7 @@ from torch import Tensor
 
 from fb3d_rl.policies.contact import Contact
 from fb3d_rl.policies.hand import VelocityLimits
-
-if TYPE_CHECKING:
-    from fb3d_rl.policies.flow_policy import FlowPolicyOptions
+from fb3d_rl.policies.options import FlowPolicyOptions
 
 SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
 """Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2, 4 and 5, articulation execution (I.G) is 3."""

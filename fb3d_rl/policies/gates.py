@@ -245,9 +245,6 @@ GATES: dict[str, type[Gate]] = {
 }
 """The gates by name."""
 
-BUDGETED = ("safe", "lazy", "thrifty")
-"""Those whose thresholds a budget sets."""
-
 
 def make_gate(name: str, **options: Any) -> Gate:
     """The gate of that name.

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,12 +17,12 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from fb3d_rl.contract import Key
-from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
+from fb3d_rl.policies.options import LearnerOptions
 from fb3d_rl.policies.policy import Policy
 
 TWIST = 6
@@ -61,48 +60,6 @@ FLOW_KEYS: dict[str, Key | None] = {
     "artflownet": ("prediction", "flow"),
 }
 """Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
-
-
-@dataclass(frozen=True)
-class LearnerOptions:
-    """The learner's network.
-
-    Attributes:
-        encoder: "attention", "pointnet" or "pointnet2", see :mod:`fb3d_rl.models.encoders`.
-        head: "deterministic", or "gaussian": a mean and a standard deviation; the mean is executed.
-        flow: the flow as a further input of each point: "none", "ground_truth", or "artflownet" for its prediction.
-        points: how many points of a cloud the network reads, the first ones; they come in random order.
-        width: of the network's layers.
-        history: control steps before the present one whose hand features it remembers.
-        chunk: control steps that it plans ahead ...
-        execute: ... of which this many are executed before it plans again.
-        discrepancy: whether it also predicts its distance from the expert, which some gates ask for.
-    """
-
-    encoder: Literal["attention", "pointnet", "pointnet2"] = "attention"
-    head: Literal["deterministic", "gaussian"] = "deterministic"
-    flow: Literal["none", "ground_truth", "artflownet"] = "none"
-    points: int = 256
-    width: int = 64
-    history: int = 3
-    chunk: int = 1
-    execute: int = 1
-    discrepancy: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            UserError: a value is unknown or out of range.
-        """
-        for name, choices in (("encoder", ENCODERS), ("head", ("deterministic", "gaussian")), ("flow", FLOW_KEYS)):
-            if getattr(self, name) not in choices:
-                raise UserError(f"{name}={getattr(self, name)} is unknown; choose from {', '.join(choices)}")
-        for name, least in (("points", 16), ("width", 4), ("history", 0), ("chunk", 1), ("execute", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name}={getattr(self, name)} is too small; give {least} or more")
-        if self.execute > self.chunk:
-            raise UserError(f"execute={self.execute} is more than the chunk={self.chunk} that is planned")
 
 
 class TwistNetwork(nn.Module):

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -30,25 +30,10 @@ from torchrl.envs.utils import ExplorationType
 
 from fb3d_rl.contract import Key
 from fb3d_rl.errors import UserError
+from fb3d_rl.rollout.options import CollectorOptions
 from fb3d_rl.rollout.worker import EpisodeCollector, Worker, WorkerDied, start_ray
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class CollectorOptions:
-    """Where environments and policy run.
-
-    Attributes:
-        backend: "direct" is this process; "process" are worker processes; "ray" are Ray actors, on the cluster that
-            RAY_ADDRESS names or else on this machine.
-        workers: number of workers; "direct" has one in any case.
-        restarts: how many workers that died are started again, in total.
-    """
-
-    backend: Literal["direct", "process", "ray"] = "direct"
-    workers: int = 1
-    restarts: int = 20
 
 
 @dataclass(frozen=True)

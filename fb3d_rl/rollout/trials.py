@@ -8,15 +8,15 @@ import json
 import zlib
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.cache import content_digest
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.env.options import Start, Trial, default_trial, drawn_fraction
+from fb3d_rl.env.options import Trial, default_trial
 from fb3d_rl.errors import UserError
+from fb3d_rl.rollout.options import ScheduleOptions
 from fb3d_rl.scene.observer import find_view
 from fb3d_rl.scene.posed import Posed
 
@@ -44,32 +44,6 @@ def trial_key(obj: ArticulatedObject, trial: Trial, hold: str) -> str:
     """
     whole = [obj.id, content_digest(obj), *astuple(trial), hold]  # astuple: every field, those to come as well
     return hashlib.sha256(json.dumps(whole).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-
-
-@dataclass(frozen=True)
-class ScheduleOptions:
-    """How trials start, what their goal is, and how often each is repeated.
-
-    Attributes:
-        start: how far the part is open at the start: "reference" (20 % in some categories, else closed), "closed",
-            "random" (uniform, up to 90 %).
-        goal: "open", fully (UMPNet's exploration), or "state", a joint state that is drawn at least 30 % of the range
-            away from the start, which is random then, towards opening or closing (UMPNet's manipulation).
-        repeats: trials of each part, each with a view and a seed of its own.
-    """
-
-    start: Start = "reference"
-    goal: Literal["open", "state"] = "open"
-    repeats: int = 1
-
-    def draw(self, rng: np.random.Generator) -> dict[str, float | None]:
-        """Start and goal of a trial, for :func:`~fb3d_rl.env.options.default_trial`."""
-        if self.goal == "state":
-            start, goal = rng.random(2)
-            while abs(goal - start) < 0.3:
-                start, goal = rng.random(2)
-            return {"fraction": float(start), "goal": float(goal)}
-        return {"fraction": drawn_fraction(self.start, rng)}
 
 
 def schedule(

@@ -130,7 +130,8 @@ def _loop(
     device: torch.device | str,
 ) -> None:
     """The steps that are left, with what happens between them."""
-    options, processes = state.options, rank_and_count()[1]
+    options: FitOptions = state.options
+    processes = rank_and_count()[1]
     started, first = time.perf_counter(), state.step
     while state.step < options.steps:
         loss = _summed(device, state.update(objective, draw(state.step)))[0] / processes

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 from fb3d_rl.errors import UserError
 
-SCHEDULES = ("constant", "linear", "exponential", "first")
+Schedule = Literal["constant", "linear", "exponential", "first"]
+SCHEDULES: tuple[str, ...] = get_args(Schedule)
 
 
 def beta(schedule: str, index: int, value: float = 1.0, rounds: int = 10, base: float = 0.5) -> float:
