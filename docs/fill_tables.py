@@ -97,7 +97,9 @@ def decision_ms(below: str) -> Cell:
     """A column of the wall time of a decision."""
 
     def cell(row: Row) -> str:
-        time = summary(f"{below}/{row.folder}")[f"{row.policy}/time/decision_ms"]
+        time = summary(f"{below}/{row.folder}").get(f"{row.policy}/time/decision_ms")
+        if time is None:  # the machine did other work
+            return "–"
         return f"{time:.1f}" if time < 10 else f"{time:.0f}"
 
     return cell
