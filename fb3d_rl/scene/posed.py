@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from pkgutil import resolve_name
 
 import numpy as np
 import torch
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
-from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
+from fb3d_rl.camera.options import SENSORS, CameraOptions
+from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.kinematics.opening import link_corners, openable_links, opening_range, standing_pose
 from fb3d_rl.kinematics.tree import KinematicTree
 
@@ -50,7 +52,9 @@ class Posed:
     @cached_property
     def camera(self) -> RaycastCamera:
         """Sees the object's links and then the further bodies."""
-        return RaycastCamera(self.obj, self.bodies, self._optics)
+        optics = self._optics or CameraOptions()
+        made: RaycastCamera = resolve_name(SENSORS[optics.kind])(self.obj, self.bodies, optics)
+        return made
 
     @property
     def visuals(self) -> list[Sequence[Mesh]]:
