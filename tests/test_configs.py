@@ -10,6 +10,8 @@ import math
 import os
 import re
 import runpy
+import subprocess
+import sys
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -332,6 +334,12 @@ def test_a_schema_stands_for_its_options(kind: type) -> None:
     for item, _, about in options.keys(kind):
         assert getattr(again, item.name) == getattr(own, item.name)
         assert about.help
+
+
+def test_a_configuration_is_checked_before_anything_slow_is_imported() -> None:
+    code = "import sys, fb3d_rl.config as c; c.help_of('train'); print({'torch', 'sapien', 'hydra'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert done.stdout == "set()\n"
 
 
 def test_the_reference_is_current() -> None:
