@@ -2,12 +2,13 @@
 # make test    .venv, then the default tests
 # make slow    .venv, then the slow ones
 # make check   lint, types and import rules
+# make docs    the documentation, into site/
 # make lock    pin the dependencies anew
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install train test slow check lock clean
+.PHONY: install train test slow check docs lock clean
 
 install: $(VENV)/installed
 
@@ -30,6 +31,17 @@ check: $(VENV)/installed
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: extra-docs
+	$(BIN)/mkdocs build --strict
+
+# What an extra of pyproject.toml names, without the package's own dependencies, which the lock holds: make extra-ray ...
+EXTRA = import sys; from importlib.metadata import requires; [print(line.split(";")[0]) for line in requires("fb3d_rl") \
+  if line.endswith(f"extra == \"{sys.argv[1]}\"")]
+extra-%: $(VENV)/installed
+	grep -v "^opencv" requirements.lock > $(VENV)/constraints.txt
+	$(BIN)/python -c '$(EXTRA)' $* > $(VENV)/extra-$*.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(VENV)/constraints.txt -r $(VENV)/extra-$*.txt
 
 # mani-skill asks for opencv-python, whose window toolkit needs the system's libGL and glib; the headless build of the
 # same version is the same module without it. Reinstalled, because the two share files, which go with the former.

@@ -3,6 +3,9 @@
 World frame: right-handed, z up, metres, radians. ``T_ab`` maps coordinates in b to coordinates in a (column
 vectors). Quaternions are wxyz, unit, w >= 0. Leading dims: env ``[E]``, rollout ``[E, T]``, rows ``[R]``.
 N is the number of points of a cloud (1200 unless configured otherwise).
+
+What a policy carries from step to step is its own affair: it declares it (:mod:`fb3d_rl.policies.policy`), the flow
+policy under "policy" (:class:`fb3d_rl.policies.flow_state.FlowState`).
 """
 
 from __future__ import annotations
@@ -12,8 +15,6 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 
-UNTRAINED = ("expert", "random", "normal")
-"""Policies that need no checkpoint."""
 ACTION_DIM = 8
 """x y z, roll pitch yaw, two fingers (supplement, II.C)."""
 

@@ -1,9 +1,12 @@
-"""Settings as YAML has them: nested mappings, told apart by dotted keys."""
+"""Settings as YAML has them (nested mappings, told apart by dotted keys), and the names that they know."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
+
+UNTRAINED = ("expert", "random", "normal")
+"""Policies that need no checkpoint."""
 
 
 def leaves(tree: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -23,18 +23,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from fb3d_rl import interrupt
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
+from fb3d_rl import config, interrupt
 from fb3d_rl.errors import Interrupted, UserError, of_disk
+from fb3d_rl.places import folder
 
-CONF = str(Path(__file__).resolve().parents[1] / "conf")
-SCHEMAS: dict[str, type[TrainConfig | EvaluateConfig | ViewConfig]] = {
-    "train": TrainConfig,
-    "evaluate": EvaluateConfig,
-    "view": ViewConfig,
-}
-
-ALGOS = {"artflownet": ArtFlowNetConfig, "imitation": ImitationConfig}
+CONF = str(folder("conf"))
 
 
 def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> None:
@@ -45,25 +38,23 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
     Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend. A job of a sweep (-m) that fails
     leaves the others alone: it is named when it does and in the end, and the exit code is 2.
     """
-    schemas = {**SCHEMAS, **{f"algo/{kind}": node for kind, node in ALGOS.items()}}
     process = os.getpid()
     failed: dict[str, str] = {}  # what is wrong with jobs of a sweep
     jobs: list[str] = []  # all of them
-    ConfigStore.instance().store(name=f"{name}_schema", node=SCHEMAS[name])
-    for kind, node in ALGOS.items():
-        ConfigStore.instance().store(group="algo", name=f"{kind}_schema", node=node)
+    for (group, entry), node in config.schemas(name).items():
+        ConfigStore.instance().store(group=group, name=entry, node=node)
 
     @hydra.main(version_base="1.3", config_path=CONF, config_name=name)
     def job(raw: DictConfig) -> None:
         hydra_config = HydraConfig.get()
         if hydra_config.mode != RunMode.MULTIRUN:
-            one(raw)
+            _run(raw, name, task, keeps)
             return
         common = {word.lower() for word in sys.argv}
         swept = [word for word in hydra_config.overrides.task if word.lower() not in common]
         jobs.append(f"job {hydra_config.job.num} ({' '.join(swept)})")
         try:
-            one(raw, f"{jobs[-1]}: ")
+            _run(raw, name, task, keeps, f"{jobs[-1]}: ")
         except _Failed as failure:
             if os.getpid() != process:  # a launcher of other processes hands on what is raised
                 raise UserError(failure.sentence) from None
@@ -74,33 +65,36 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
             traceback.print_exc()
             failed[jobs[-1]] = f"{type(error).__name__}: {error}"
 
-    def one(raw: DictConfig, where: str = "") -> None:
-        out = Path(HydraConfig.get().runtime.output_dir)
-        with _one_sentence(where):
-            if not keeps:
-                cfg: Any = OmegaConf.to_object(raw)
-                validate(cfg)
-                task(cfg, out)
-                return
-            with run_folder.locked(out):
-                fresh = run_folder.is_new(out)
-                try:
-                    cfg = OmegaConf.to_object(run_folder.configuration(raw, name, out, schemas))
-                    validate(cfg)
-                    task(cfg, out)
-                except UserError:
-                    # A run that never began leaves no folder; only who holds it may take it away.
-                    if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
-                        shutil.rmtree(out)
-                    raise
-
-    with _one_sentence():
-        job()
+    try:
+        with _one_sentence():
+            job()
+    finally:
+        if {"--help", "-h"} & {*sys.argv}:  # beneath Hydra's
+            print(config.help_of(name))
     if failed:
         print(f"error: {len(failed)} of {len(jobs)} jobs failed:", file=sys.stderr)
         for name, sentence in failed.items():
             print(f"  {name}: {sentence}", file=sys.stderr)
         sys.exit(2)
+
+
+def _run(raw: DictConfig, name: str, task: Callable[[Any, Path], Any], keeps: bool, where: str = "") -> None:
+    """Run the task with what Hydra composed, as :func:`main` says; ``where`` stands before what is wrong."""
+    out = Path(HydraConfig.get().runtime.output_dir)
+    with _one_sentence(where):
+        if not keeps:
+            task(config.configured(OmegaConf.to_object(raw)), out)
+            return
+        with run_folder.locked(out):
+            fresh = run_folder.is_new(out)
+            try:
+                composed = OmegaConf.to_object(run_folder.configuration(raw, name, out))
+                task(config.configured(composed), out)
+            except UserError:
+                # A run that never began leaves no folder; only who holds it may take it away.
+                if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
+                    shutil.rmtree(out)
+                raise
 
 
 def report(out: Path) -> None:

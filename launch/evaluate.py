@@ -15,9 +15,9 @@ from command import main, report
 
 def task(cfg: Any, out: Path) -> None:
     """Evaluate the configured policy; the imports take seconds, so they come after the configuration's checks."""
-    from fb3d_rl.algos import artflownet, dagger
+    from fb3d_rl.algos.run import run_evaluation
 
-    (dagger if cfg.policy.name in dagger.ALGOS else artflownet).run_evaluation(cfg, out)
+    run_evaluation(cfg, out)
     report(out)
 
 

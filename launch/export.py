@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> None:
     """Read and write."""
-    from fb3d_rl.algos.artflownet import load_network
+    from fb3d_rl.algos.weights import load_network
     from fb3d_rl.errors import UserError
     from fb3d_rl.models.export import export
     from fb3d_rl.training.checkpoint import load_checkpoint

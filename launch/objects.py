@@ -1,6 +1,6 @@
 """Make procedural objects, unpack and list objects, look at them, and find out what is wrong with them.
 
-python launch/objects.py generate --out DIR [--categories all|train|test|NAME,...] [--count 50] [--seed 0]
+python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
 python launch/objects.py unpack ARCHIVE --out DIR
 python launch/objects.py list DIR [--split SPLIT]
 python launch/objects.py validate DIR [--out FILE.json] [--workers N]
@@ -40,7 +40,10 @@ def _parser() -> argparse.ArgumentParser:
     make = commands.add_parser("generate", help=says, description=says)
     make.add_argument("--out", type=Path, required=True, metavar="DIR")
     make.add_argument(
-        "--categories", default="all", help="all, train or test (UMPNet's), or names with commas (default: all)"
+        "--categories",
+        default="all",
+        help="all, train or test (UMPNet's 21 categories or halves of them), mechanisms (buttons, levers, caps, "
+        "blades, wheels ... on bodies of any kind), or names such as Box or AmbiguousDoor, with commas (default: all)",
     )
     make.add_argument("--count", type=int, default=50, help="objects of each category (default: 50)")
     make.add_argument("--seed", type=int, default=0)

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> None:
     """Read the runs, print and write."""
     from fb3d_rl.errors import UserError
-    from fb3d_rl.evaluation import comparison, published, runs, tables
+    from fb3d_rl.evaluation import comparison, comparison_tables, published, runs, tables
     from fb3d_rl.files import write_text
     from fb3d_rl.report import comparison_page
     from fb3d_rl.report import run_page as report
@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
         resolved = [folder.resolve() for folder in folders]
         beside = resolved[0] if len(folders) == 1 else Path(os.path.commonpath([run.parent for run in resolved]))
         path = comparison_page.write_comparison(found, options.out or beside / "comparison.html", unfinished)
-        comparison.show(found)
+        comparison_tables.show(found)
         if unfinished:
             print(f"left out, not finished (no summary.json): {', '.join(map(str, unfinished))}")
     print(f"wrote {path}")

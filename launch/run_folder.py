@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,12 +15,26 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from fb3d_rl.config import RUN_FILES, changes_no_number
+from fb3d_rl import config
 from fb3d_rl.errors import UserError
+from fb3d_rl.options import schema
 from fb3d_rl.settings import leaves
 
 CONFIG = "config.yaml"
 LOCK = ".lock"
+RUN_FILES = frozenset(
+    {
+        CONFIG, "metrics.jsonl", "checkpoint.pt", "best.safetensors", "rows.csv", "decision_times.jsonl",
+        "flow_rows.csv", "flow_rows_all_parts.csv", "summary.json", "report.html", "clouds.npz", "flow.png", "videos",
+        "samples", "met", "buffer", "objects",
+    }
+)  # fmt: skip
+"""What a run leaves in its folder; a new run wants a folder without any of it."""
+
+
+def changes_no_number(key: str) -> bool:
+    """Whether a run may go on with another value of this dotted key: where it computes, and where its log goes."""
+    return key in ("device", "data.workers") or key.startswith(("collector.", "logger."))
 
 
 def first_process() -> bool:
@@ -61,14 +76,13 @@ def locked(out: Path) -> Iterator[None]:
         lock.release()
 
 
-def configuration(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> DictConfig:
+def configuration(raw: DictConfig, name: str, out: Path) -> DictConfig:
     """The configuration of the run in ``out``: ``raw`` in a new folder, else what that one was begun with.
 
     Args:
         raw: as composed from the command line.
         name: of the command's file in conf/.
         out: the run folder.
-        schemas: typed schemas: of the command by its name, and of the group ``algo`` by "algo/<name>".
 
     Raises:
         UserError: the folder is used, or holds no run to go on with, or one with other settings.
@@ -76,12 +90,12 @@ def configuration(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]
     resume = bool(raw.get("resume", False))
     begun = (out / CONFIG).is_file()
     if not first_process():
-        return raw if not resume else _resumed(raw, name, out, schemas)
+        return raw if not resume else _resumed(raw, name, out)
     # What a sweep had not begun when it was interrupted begins now.
     if resume and (begun or HydraConfig.get().mode != RunMode.MULTIRUN or not is_new(out)):
         if not begun:
             raise UserError(f"resume=true, but {out} holds no run ({CONFIG}); name its folder: hydra.run.dir=RUN")
-        return _resumed(raw, name, out, schemas)
+        return _resumed(raw, name, out)
     used = sorted({path.name for path in out.iterdir()} & RUN_FILES)
     if used:
         raise UserError(
@@ -95,7 +109,7 @@ def configuration(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]
     return fresh
 
 
-def _resumed(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> DictConfig:
+def _resumed(raw: DictConfig, name: str, out: Path) -> DictConfig:
     """The folder's configuration, with what this command changes of it."""
     kept = OmegaConf.load(out / CONFIG)
     if not isinstance(kept, DictConfig):
@@ -107,12 +121,15 @@ def _resumed(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> 
                 f"{out} was begun with {key}={before.get(key)}, not {asked.get(key)}: leave it out to go on, as a "
                 "resumed run takes its settings from its folder, or choose another folder: hydra.run.dir=DIR"
             )
-    schema = OmegaConf.structured(schemas[name])
+    typed = OmegaConf.structured(schema(config.COMMANDS[name]))
     if "algo" in kept:
-        schema.algo = OmegaConf.structured(schemas["algo/imitation" if "rounds" in kept.algo else "algo/artflownet"])
-    config = OmegaConf.merge(schema, kept)
-    assert isinstance(config, DictConfig)
-    missing = sorted(OmegaConf.missing_keys(config))
+        kinds = config.algorithms()
+        config.one_of("algo.name", kept.algo.name, tuple(kinds))
+        typed.algo = OmegaConf.structured(schema(kinds[kept.algo.name]))
+    merged = OmegaConf.merge(typed, kept)
+    assert isinstance(merged, DictConfig)
+    # What a key that it lacks was then is not today's default.
+    missing = sorted(key for key in _leaves(typed) if not any(f"{had}.".startswith(f"{key}.") for had in before))
     if missing:
         raise UserError(
             f"{out} was begun with another version of fb3d_rl, without {', '.join(missing[:3])}: go on with that "
@@ -120,9 +137,9 @@ def _resumed(raw: DictConfig, name: str, out: Path, schemas: dict[str, Any]) -> 
         )
     for key in touched:
         if changes_no_number(key):
-            OmegaConf.update(config, key, asked[key])
-    config.resume = True
-    return config
+            OmegaConf.update(merged, key, asked[key])
+    merged.resume = True
+    return merged
 
 
 def _touched(raw: DictConfig, name: str) -> set[str]:
@@ -141,7 +158,19 @@ def _touched(raw: DictConfig, name: str) -> set[str]:
             without = _leaves(compose(name, [f"~{key}"]))
             alone = _leaves(compose(name, [override.input_line or ""]))
             below = {leaf for leaf in {*without, *alone} if without.get(leaf, _leaves) != alone.get(leaf, _leaves)}
+            below |= _own_keys(key)  # even where it says what is the default
         keys |= below or {key}
+    return keys
+
+
+def _own_keys(group: str) -> set[str]:
+    """The dotted keys that any file of a group sets in the group's own part of the configuration."""
+    keys: set[str] = set()
+    for path in (Path(_conf()) / group).glob("*.yaml"):
+        package = re.search(r"^# @package (\S+)", path.read_text(), re.MULTILINE)
+        part = package.group(1) if package else group
+        if part != "_global_":
+            keys |= {f"{part}.{leaf}" for leaf in _leaves(OmegaConf.load(path)) if leaf != "defaults"}
     return keys
 
 

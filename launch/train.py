@@ -18,14 +18,15 @@ from command import main, report
 
 def task(cfg: Any, out: Path) -> None:
     """Run the configured algorithm; its imports take seconds, so they come after the configuration's checks."""
-    from fb3d_rl.algos import artflownet, dagger
+    from fb3d_rl.algos.run import run_training
     from fb3d_rl.errors import UserError
+    from fb3d_rl.registry import REGISTRY
     from fb3d_rl.training.processes import joined, rank_and_count, started
 
-    if cfg.algo.name != "artflownet" and started() > 1:
+    if not REGISTRY[cfg.algo.name].joint_fit and started() > 1:
         raise UserError(f"algo={cfg.algo.name} is trained by one process: start it without torchrun")
     with joined(out, fresh=not cfg.resume) as shared:
-        (dagger if cfg.algo.name in dagger.ALGOS else artflownet).run(cfg, shared)
+        run_training(cfg, shared)
         if rank_and_count()[0] == 0:
             report(shared)
 

@@ -17,7 +17,7 @@ from command import main
 def task(cfg: Any, out: Path) -> None:
     """Serve the page until Ctrl-C; the imports take seconds, so they come after the configuration's checks."""
     from fb3d_rl.algos import setup
-    from fb3d_rl.algos.artflownet import load_network
+    from fb3d_rl.algos.weights import load_network
     from fb3d_rl.live.page import require_viser, serve
     from fb3d_rl.live.session import Session
 

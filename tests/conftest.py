@@ -28,7 +28,8 @@ from omegaconf import OmegaConf
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.assets.procedural import generate
-from fb3d_rl.config import ArtFlowNetConfig, EvaluateConfig, ImitationConfig, TrainConfig, ViewConfig, validate
+from fb3d_rl.config import COMMANDS, EvaluateConfig, TrainConfig, ViewConfig, configured
+from fb3d_rl.config import schemas as typed_schemas
 
 ROOT = Path(__file__).resolve().parents[1]
 Launch: TypeAlias = "Callable[..., CompletedProcess[str]]"
@@ -138,10 +139,9 @@ def real_root() -> Path:
 def schemas() -> None:
     """The typed schemas that conf/ names, as the commands register them."""
     store = ConfigStore.instance()
-    for name, schema in (("train", TrainConfig), ("evaluate", EvaluateConfig), ("view", ViewConfig)):
-        store.store(name=f"{name}_schema", node=schema)
-    for kind, algo in (("artflownet", ArtFlowNetConfig), ("imitation", ImitationConfig)):
-        store.store(group="algo", name=f"{kind}_schema", node=algo)
+    for command in COMMANDS:
+        for (group, name), node in typed_schemas(command).items():
+            store.store(group=group, name=name, node=node)
 
 
 @pytest.fixture(scope="session")
@@ -150,8 +150,8 @@ def config(schemas: None) -> Callable[[str, list[str]], Any]:
 
     def composed(name: str, overrides: list[str]) -> TrainConfig | EvaluateConfig | ViewConfig:
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            cfg = OmegaConf.to_object(compose(name, overrides))
-        validate(cfg)
+            composed = compose(name, overrides)
+        cfg: TrainConfig | EvaluateConfig | ViewConfig = configured(OmegaConf.to_object(composed))
         return cfg
 
     return composed

@@ -12,7 +12,9 @@ from typing import Any
 
 import pytest
 
-from fb3d_rl.algos.artflownet import best_cosine, load_network, run, run_evaluation
+from fb3d_rl.algos.run import run_evaluation
+from fb3d_rl.algos.run import run_training as run
+from fb3d_rl.algos.weights import best_cosine, load_network
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate as evaluation
 from fb3d_rl.rollout.rows import read_trials, write_trials

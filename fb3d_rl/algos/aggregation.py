@@ -21,12 +21,12 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.cache import content_digest
 from fb3d_rl.contract import Key
 from fb3d_rl.data.generate import empty_rows, finish, finished_rows
-from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
 from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.run import create_env, state_of
 from fb3d_rl.rollout.trials import BARREN, draw_trials
+from fb3d_rl.scene.posed import Posed
 
 EVERY = 0.2
 """Time (s) from one frame that is kept to the next: sooner they are nearly alike."""
@@ -70,7 +70,7 @@ def meet_samples(
         progress(count)
         return done
     rows = empty_rows(out, count, protocol.samples.points)
-    views = [ObjectView(obj, protocol.samples.camera) for obj in objects]
+    views = [Posed(obj, protocol.samples.camera) for obj in objects]
     number = {obj.id: index for index, obj in enumerate(objects)}
     rng = np.random.default_rng([protocol.seed, 6])
     create = partial(create_env, tuple(objects), protocol.env, state_of(policy))

@@ -13,14 +13,15 @@ from tensordict import TensorDictBase
 
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
-from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
-from fb3d_rl.policies.learner import SEEN, feel, history_of, twist_of
+from fb3d_rl.policies.learner import OBSERVED, hand_features, history_of, twist_of
 from fb3d_rl.rollout import demonstrations
 from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.demonstrations import episode_info
 from fb3d_rl.rollout.trials import BARREN, draw_trials
+from fb3d_rl.scene.posed import Posed
 
 STEPS_OF_TRIAL = 60
 """Labels that a trial is reckoned to bring."""
@@ -50,7 +51,7 @@ class Round:
 
 def collect(
     workers: Workers,
-    views: Sequence[ObjectView],
+    views: Sequence[Posed],
     samples: SampleOptions,
     rows: RowsOptions,
     number: int,
@@ -147,7 +148,7 @@ class RowsOptions:
 
     def keys(self) -> list[Key]:
         """What the workers have to send."""
-        return [*SEEN, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
+        return [*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
 
     def why_none(self, ended: int, error: str) -> str:
         """Why trials brought no rows, and what to change, if ``ended`` of a round did not crash with ``error``."""
@@ -160,10 +161,10 @@ class RowsOptions:
 
     def of(self, frames: TensorDictBase) -> TensorDictBase:
         """The rows of an episode's frames [T]: with the label as a twist, and what the learner remembers."""
-        rows = frames.select(*SEEN, *([self.flow] if self.flow else ()), *EXPERT, *self.further)
+        rows = frames.select(*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further)
         rows["expert", "twist"] = twist_of(rows["observation"], rows["expert", "action"], self.limits)
         if self.history:
-            rows["learner", "felt"] = history_of(feel(rows["observation"], self.limits), self.history)
+            rows["learner", "felt"] = history_of(hand_features(rows["observation"], self.limits), self.history)
         return rows[rows["observation", "attached"].squeeze(-1)] if self.attached_only else rows
 
 
@@ -173,7 +174,7 @@ def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer
     Raises:
         UserError: they lack what the learner reads.
     """
-    lacking = [key for key in (*SEEN, *([rows.flow] if rows.flow else ()), *EXPERT) if key not in source.keys]
+    lacking = [key for key in (*OBSERVED, *([rows.flow] if rows.flow else ()), *EXPERT) if key not in source.keys]
     if lacking:
         raise UserError(f"the demonstrations at {source.path} lack {', '.join(map(str, lacking))}; record them anew")
     for episode, info in enumerate(source.episodes):

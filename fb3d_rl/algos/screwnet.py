@@ -1,4 +1,4 @@
-"""algo=screwnet: what ScrewNet is fitted to."""
+"""algo=screwnet, FlowBot3D's baseline "Screw Parameters": what ScrewNet is fitted to."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fb3d_rl.algos.flow_network import FlowNetwork
 from fb3d_rl.kinematics.joint_screw import JointScrew, screw_of_flow
 from fb3d_rl.models.screwnet import ScrewNet
-from fb3d_rl.training.fit import FitOptions, Objective, augment, products_of
+from fb3d_rl.training.device import products_of
+from fb3d_rl.training.draws import augment
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
@@ -70,3 +74,6 @@ def screw_objective(model: nn.Module, options: FitOptions) -> Objective:
         return screw_loss(votes, target, points, part & labelled[:, None])
 
     return objective
+
+
+ALGORITHM = FlowNetwork(ScrewNet, objective=screw_objective)

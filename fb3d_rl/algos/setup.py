@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 
@@ -24,24 +24,24 @@ from fb3d_rl.assets.catalog import (
     procedural_catalog,
 )
 from fb3d_rl.assets.splits import validation_ids
-from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import ViewRange
-from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.data.options import SampleOptions
 from fb3d_rl.drawing.video import require_encoder
-from fb3d_rl.env.options import EnvOptions, GripperOptions, Start, SuctionOptions
+from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
-from fb3d_rl.policies.contact import ContactOptions
-from fb3d_rl.policies.flow_policy import FlowPolicyOptions
+from fb3d_rl.options import taken
 from fb3d_rl.policies.hand import VelocityLimits
-from fb3d_rl.rollout.collectors import CollectorOptions
+from fb3d_rl.policies.options import FlowPolicyOptions
+from fb3d_rl.rollout.options import CollectorOptions, ScheduleOptions
 from fb3d_rl.rollout.run import limits_of
-from fb3d_rl.rollout.trials import ScheduleOptions
 from fb3d_rl.training.checkpoint import git_revision
 
 if TYPE_CHECKING:
-    from fb3d_rl.config import AssetsConfig, CommandConfig, ViewConfig
+    from fb3d_rl.assets.options import AssetsOptions
+    from fb3d_rl.config import CommandConfig, ViewConfig
 
 Config = TypeVar("Config", bound="CommandConfig")
 
@@ -55,7 +55,7 @@ class TrainEntries:
     held_out: list[Entry]
 
 
-def train_entries(assets: AssetsConfig, out: Path, seed: int) -> TrainEntries:
+def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
     """The objects that training is about."""
     made = _made(assets, out, seed, assets.train_count)
     train = [entry for entry in made if entry.split == "train_train"]
@@ -71,7 +71,7 @@ def train_entries(assets: AssetsConfig, out: Path, seed: int) -> TrainEntries:
     )
 
 
-def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
+def eval_entries(assets: AssetsOptions, out: Path, seed: int) -> list[Entry]:
     """Objects to evaluate on."""
     made = _made(assets, out, seed, 0)
     if assets.source == "procedural":
@@ -79,7 +79,7 @@ def eval_entries(assets: AssetsConfig, out: Path, seed: int) -> list[Entry]:
     return partnet_catalog(assets.root, assets.split, assets.split_file) + _beside_real(made)
 
 
-def _made(assets: AssetsConfig, out: Path, seed: int, train_count: int) -> list[Entry]:
+def _made(assets: AssetsOptions, out: Path, seed: int, train_count: int) -> list[Entry]:
     """The procedural objects, if there are to be any."""
     if assets.source != "procedural" and not (assets.categories or assets.unseen_categories):
         return []
@@ -120,29 +120,10 @@ def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
     return [(entry.load(), entry.split) for entry in entries]
 
 
-def camera_options(cfg: CommandConfig) -> CameraOptions:
-    """The depth camera's optics."""
-    return CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
-
-
-def view_range(cfg: CommandConfig) -> ViewRange:
-    """Where the camera may stand."""
-    (left, right), (low, high) = cfg.camera.azimuth, cfg.camera.elevation
-    return ViewRange((left, right), (low, high))
-
-
 def sample_options(cfg: CommandConfig) -> SampleOptions:
-    """How clouds are taken."""
-    data = cfg.data
-    return SampleOptions(
-        points=data.points,
-        views=view_range(cfg),
-        camera=camera_options(cfg),
-        closed_share=data.closed_share,
-        others_closed=data.others_closed,
-        all_parts_share=data.all_parts_share,
-        some_parts_share=data.some_parts_share,
-    )
+    """How clouds are taken: ray-cast, whatever the task sees with."""
+    optics = CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
+    return replace(taken(SampleOptions, cfg.data), views=taken(ViewRange, cfg.camera), camera=optics)
 
 
 def settled(cfg: Config, part_mask_input: bool | None = None) -> Config:
@@ -162,30 +143,15 @@ def settled(cfg: Config, part_mask_input: bool | None = None) -> Config:
 
 def env_options(cfg: CommandConfig) -> EnvOptions:
     """The task's constants."""
-    env = settled(cfg).env
-    kind = cast(Literal["raycast", "sapien"], cfg.camera.kind)
-    return EnvOptions(
-        gripper=GripperOptions(**asdict(env.gripper)),
-        suction=SuctionOptions(**asdict(env.suction)),
-        views=view_range(cfg),
-        points=cfg.data.points,
-        horizon=env.horizon,
-        success=env.success,
-        sim_freq=env.sim_freq,
-        control_freq=env.control_freq,
-        gravity=env.gravity,
-        joint_friction=env.joint_friction,
-        joint_damping=env.joint_damping,
-        density=env.density,
-        camera=replace(camera_options(cfg), kind=kind, shader=cfg.camera.shader),
-    )
+    camera, views = taken(CameraOptions, cfg.camera), taken(ViewRange, cfg.camera)
+    return replace(settled(cfg).env, views=views, points=cfg.data.points, camera=camera)
 
 
 def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
     """Speeds, distances and times of the flow policy, and the mask that it sees."""
     policy = settled(cfg).policy
-    mask = cast(Literal["target", "none"], policy.mask)
-    return FlowPolicyOptions(**asdict(policy.flow), mask=mask, contact=ContactOptions(**asdict(policy.contact)))
+    assert policy.mask is not None
+    return replace(policy.flow, mask=policy.mask, contact=policy.contact)
 
 
 def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
@@ -213,11 +179,7 @@ def protocol(cfg: CommandConfig, resume: bool = False) -> Protocol:
         clouds=cfg.evaluation.clouds,
         videos=cfg.evaluation.videos,
         seed=cfg.seed,
-        schedule=ScheduleOptions(
-            cast(Start, cfg.evaluation.start),
-            cast(Literal["open", "state"], cfg.evaluation.goal),
-            cfg.evaluation.repeats,
-        ),
+        schedule=taken(ScheduleOptions, cfg.evaluation),
         decision_seconds=cfg.evaluation.decision_seconds,
         resume=resume,
         device=device,
@@ -237,9 +199,8 @@ def choose_device(name: str) -> torch.device:
 
 def collector_options(cfg: CommandConfig, spare: int = 0) -> CollectorOptions:
     """Where trials run, on all cores but ``spare`` unless the configuration names a number of workers."""
-    collector: Any = cfg.collector
-    count = max(1, workers(None) - spare) if collector.workers is None else collector.workers
-    return CollectorOptions(collector.backend, count, collector.restarts)
+    named: int | None = cfg.collector.workers  # null until here
+    return replace(cfg.collector, workers=max(1, workers(None) - spare) if named is None else named)
 
 
 def workers(count: int | None) -> int:

@@ -6,11 +6,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from fb3d_rl.algos.flow_network import FlowNetwork
 from fb3d_rl.geometry.points import gather
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.models.direction_net import DirectionNet, SearchOptions, directions_at
-from fb3d_rl.training.fit import FitOptions, Objective, augment, generator, products_of
+from fb3d_rl.policies.direction_policy import direction_policy
+from fb3d_rl.training.device import products_of
+from fb3d_rl.training.draws import augment, generator
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 
 CONTACTS = 16
 """Contact points that are drawn on the part of each cloud ..."""
@@ -57,3 +62,6 @@ def direction_cosine(net: CloudNetwork, samples: TensorDictBase, device: torch.d
         # Where nothing moves there is no direction.
         cosines.append(torch.where(true.any(-1), (found * normalize(true)).sum(-1), torch.nan).cpu())
     return {"cosine": torch.cat(cosines)}
+
+
+ALGORITHM = FlowNetwork(DirectionNet, direction_policy, direction_objective, direction_cosine, flow=False)

@@ -1,4 +1,4 @@
-"""Unpack archives of objects from strangers: nothing leaves the target, which appears whole or not at all."""
+"""Unpack archives from untrusted sources: nothing is written outside the target, which appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ BROKEN = (
     zipfile.BadZipFile, tarfile.TarError, zlib.error, LZMAError, struct.error,
     EOFError, LookupError, OSError, OverflowError, RuntimeError, ValueError,
 )  # fmt: skip
-"""What archives that are none, are damaged, encrypted, or lead out of the target make their readers raise."""
+"""What the readers raise for files that are no archives, are damaged or encrypted, or lead out of the target."""
 
 
 def unpack(archive: Path, out: Path, progress: Callable[[int], None] = lambda size: None) -> None:
     """Unpack a .zip or .tar (.gz, .bz2, .xz) archive as the folder ``out``.
 
-    Entries that would lie outside, links that lead outside and devices are refused or laid inside.
+    Entries and links that lead outside of it, and devices, are refused or written inside.
 
     Args:
         archive: the file.
         out: the folder; it must not exist yet.
-        progress: called with the bytes of each file when it is there.
+        progress: called with the size of each file, bytes, after it is written.
 
     Raises:
         UserError: the archive is missing, broken or unsafe, does not fit the disk, or ``out`` exists.
@@ -49,9 +49,9 @@ def unpack(archive: Path, out: Path, progress: Callable[[int], None] = lambda si
             else:
                 _unpack_tar(archive, inside, room, progress)
         except BROKEN as error:
-            if isinstance(error, OSError) and error.filename is not None:  # the disk's fault, not the archive's
+            if isinstance(error, OSError) and error.filename is not None:  # an error of the disk, not of the archive
                 raise
-            raise UserError(f"{archive} cannot be unpacked ({error}); fetch it anew") from error
+            raise UserError(f"{archive} cannot be unpacked ({error}); download it again") from error
         inside.rename(out)
 
 

@@ -1,8 +1,8 @@
-"""Objects that were read before, kept on disk by the content of the files that they were read from.
+"""A cache on disk of the objects that were read, by the content of their files.
 
 Parsing the text of an object's meshes takes fifty times as long as reading its entry here. An entry begins with the
-digest of all that follows; one that does not match, or is of another version, counts as not there. The folder may be
-deleted at any time.
+digest of the rest of it; one that does not match, or is of another version, is ignored. The folder may be deleted at
+any time.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.files import write_bytes
 
 VERSION = 3
-"""Of what is kept and of the reader that makes it; raise it with either."""
+"""Version of the entries and of the reader whose results they hold; raise it when either changes."""
 
-SAID = "FB3D_CACHE_SAID"
-"""Environment variable of a command that has said that nothing can be kept."""
+WARNED = "FB3D_CACHE_WARNED"
+"""Environment variable that is set once the user was warned that the cache cannot be written."""
 
 DIGEST = hashlib.sha256().digest_size
 
@@ -39,13 +39,13 @@ Parsed = tuple[tuple[Link, ...], tuple[str, ...], tuple[str, ...]]
 
 
 def cache_folder() -> Path:
-    """Where entries lie: ``FB3D_CACHE``, or the user's cache folder of this platform."""
+    """The folder of the entries: ``FB3D_CACHE``, or the user's cache folder of this platform."""
     chosen = os.environ.get("FB3D_CACHE")
     return Path(chosen) if chosen else platformdirs.user_cache_path("fb3d_rl")
 
 
 def digest_of(folder: Path, files: Iterable[Path]) -> str:
-    """SHA-256 of the names and contents of a folder's ``files``: the same wherever the folder lies."""
+    """SHA-256 of the names and contents of a folder's ``files``: independent of where the folder is."""
     digest = hashlib.sha256()
     for file in files:
         content = file.read_bytes()
@@ -55,14 +55,14 @@ def digest_of(folder: Path, files: Iterable[Path]) -> str:
 
 
 def content_digest(obj: ArticulatedObject) -> str:
-    """What an object is made of, as a digest: of its files, or of its links where it was made in memory."""
+    """A digest of the object: of its files, or of its links if it was made in memory."""
     return obj.content or hashlib.sha256(_pack((obj.links, (), ()))).hexdigest()
 
 
 def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
-    """What ``read`` returned for files of this content (:func:`digest_of`); it is called if need be.
+    """The result of ``read`` for files of this content (:func:`digest_of`), which is called if no entry has it.
 
-    Where entries cannot be written, objects are read anew each time; that is said once.
+    If entries cannot be written, objects are read again each time; a note says so once.
     """
     key = hashlib.sha256(f"{VERSION} {trimesh.__version__} {digest}".encode())
     entry = cache_folder() / f"objects/{key.hexdigest()}"
@@ -76,19 +76,19 @@ def cached(digest: str, read: Callable[[], Parsed]) -> Parsed:
         payload = _pack(parsed)
         write_bytes(entry, hashlib.sha256(payload).digest(), payload)
     except OSError as error:
-        _tell(error)
+        _warn(error)
     return parsed
 
 
-def _tell(error: OSError) -> None:
-    """Say once for all processes of a command that there is no cache."""
+def _warn(error: OSError) -> None:
+    """Print once for all processes of a command that there is no cache."""
     process = multiprocessing.current_process()
-    # Workers that start later inherit that it was said; of those that start together one speaks.
-    if SAID in os.environ or not (multiprocessing.parent_process() is None or process.name.endswith("-1")):
+    # Workers that start later inherit the variable; of those that start together only the first prints.
+    if WARNED in os.environ or not (multiprocessing.parent_process() is None or process.name.endswith("-1")):
         return
-    os.environ[SAID] = "1"
+    os.environ[WARNED] = "1"
     print(
-        f"note: nothing can be kept in the cache {cache_folder()} ({error.strerror}), so objects are read more slowly; "
+        f"note: the cache {cache_folder()} cannot be written ({error.strerror}), so objects are read more slowly; "
         "FB3D_CACHE=DIR chooses another folder",
         file=sys.stderr,
     )

@@ -19,13 +19,13 @@ from fb3d_rl.errors import UserError
 
 log = logging.getLogger(__name__)
 
-MOST_TOLD = 5
-"""Of so many objects at once it is told what they lost, of the others how many they are."""
+MOST_NAMED = 5
+"""At most this many objects that lost geometry are named in the log; the others are counted."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An object of a catalog: its folder, category and split, and the object itself where it was read already."""
+    """An object of a catalog: its folder, category and split, and the object itself if it was read already."""
 
     folder: Path
     category: str
@@ -37,7 +37,7 @@ class Entry:
         return self.folder.name
 
     def load(self) -> ArticulatedObject:
-        """The object, read now unless it is known.
+        """The object; it is read now unless it was before.
 
         Raises:
             UserError: it cannot be used.
@@ -45,27 +45,27 @@ class Entry:
         if self.known is not None:
             return self.known
         obj = load_usable(self.folder)
-        tell_lost([obj])
+        warn_of_lost_geometry([obj])
         return obj
 
 
 LOST_GEOMETRY = "lost_geometry"
-"""Key of a summary: what the run's objects lost in reading, by their ids."""
+"""Key of a summary: the geometry that could not be read of the run's objects, by their ids."""
 
 
 def lost_geometry(objects: Iterable[ArticulatedObject]) -> dict[str, list[str]]:
-    """What of the objects' files is no part of them, by the ids of those that lost some of their geometry."""
+    """Remarks on the geometry in the objects' files that could not be read, by id; objects without any are left out."""
     return {obj.id: list(obj.lost) for obj in objects if obj.lost}
 
 
-def tell_lost(objects: Iterable[ArticulatedObject]) -> None:
-    """Log which of some objects lost geometry in reading: without it they are not what their files say."""
+def warn_of_lost_geometry(objects: Iterable[ArticulatedObject]) -> None:
+    """Log which objects lost geometry while they were read: they differ from what their files describe."""
     lost = lost_geometry(objects)
-    for name, remarks in list(lost.items())[:MOST_TOLD]:
+    for name, remarks in list(lost.items())[:MOST_NAMED]:
         log.warning("object %s: geometry left out while reading: %s", name, listed(remarks))
-    if len(lost) > MOST_TOLD:
+    if len(lost) > MOST_NAMED:
         log.warning(
-            "geometry was left out of %d more objects; launch/objects.py validate DIR names it", len(lost) - MOST_TOLD
+            "geometry was left out of %d more objects; launch/objects.py validate DIR names it", len(lost) - MOST_NAMED
         )
 
 
@@ -120,12 +120,12 @@ def partnet_catalog(
 ) -> list[Entry]:
     """The objects below a PartNet-Mobility root that ``split`` selects; broken ones are left out and named.
 
-    Objects that lost geometry in reading are named too.
+    Objects that lost geometry while they were read are named too.
 
     Args:
         root: see :mod:`fb3d_rl.assets.folders`.
         split: see :func:`fb3d_rl.assets.splits.select_ids`.
-        split_file: a file in UMPNet's format; unless given, the one that lies in the root, else UMPNet's own lists.
+        split_file: a file in UMPNet's format; unless given, the one in the root, else UMPNet's own lists.
 
     Raises:
         UserError: no such root, no object in it, an unknown split, or no usable object left.
@@ -139,7 +139,7 @@ def partnet_catalog(
     objects, skipped = load_objects([folders[name] for name in chosen])
     for item in skipped:
         log.warning("skipped: %s", item.reason)
-    tell_lost(objects)
+    warn_of_lost_geometry(objects)
     return [Entry(obj.urdf.parent, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
 
 
@@ -166,20 +166,20 @@ def find_objects(
 
 
 def entry_of(entries: Sequence[Entry], word: str | None = None) -> Entry:
-    """The entry that a word names: that of this id, or the first of this category; the first of all without a word.
+    """The entry with this id, or the first of this category; the first of all without a word.
 
     Raises:
-        UserError: the word names none of them.
+        UserError: no entry has the word as its id or category.
     """
     named = [entry for entry in entries if word in (None, entry.id)]
-    found = named or [entry for entry in entries if entry.category == word]
-    if not found:
+    matching = named or [entry for entry in entries if entry.category == word]
+    if not matching:
         ids, categories = [entry.id for entry in entries], sorted({entry.category for entry in entries})
         raise UserError(
             f"object={word} is no folder, none of the {len(ids)} ids ({', '.join(ids[:3])}, ...) and none of the "
             f"categories {', '.join(categories)}"
         )
-    return found[0]
+    return matching[0]
 
 
 def folder_entries(root: str | Path) -> list[Entry]:

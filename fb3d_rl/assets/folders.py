@@ -1,4 +1,4 @@
-"""Where the objects lie: the layouts in which PartNet-Mobility is handed around.
+"""Find objects on disk, in the folder layouts in which PartNet-Mobility is distributed.
 
 - the dataset's own: ``<id>/mobility.urdf``;
 - UMPNet's archive (Xu, He, Song, RA-L 2022): ``mobility_dataset/<Category>/<id>/mobility.urdf``, ``split-full.json``;
@@ -17,13 +17,13 @@ URDFS = ("mobility_cvx.urdf", "mobility_fixed.urdf", "mobility.urdf")
 """An object's URDF, the first that is there: ManiSkill's order, since it made the former two to simulate well."""
 
 SPLIT_FILE = "split-full.json"
-"""UMPNet's split file, which lies in its archive."""
+"""UMPNet's split file, which its archive contains."""
 
 MANISKILL = "maniskill"
 """A root of this name is ManiSkill's own asset folder."""
 
 DEPTH = 3
-"""How many folders deep below the root objects are looked for."""
+"""How many levels below the root objects are searched for."""
 
 
 def find_urdf(folder: Path) -> Path | None:
@@ -52,17 +52,17 @@ def find_folders(root: str | Path) -> dict[str, Path]:
             else "give the folder that holds <id>/mobility.urdf"
         )
         raise UserError(f"assets.root: {folder} is no folder; {how}")
-    found: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
     for path in _objects(folder, DEPTH):
         name = path.resolve().name if path == folder else path.name
-        if name in found:
-            raise UserError(f"assets.root: {found[name]} and {path} have the same id; remove one of them")
-        found[name] = path
-    if not found:
+        if name in folders:
+            raise UserError(f"assets.root: {folders[name]} and {path} have the same id; remove one of them")
+        folders[name] = path
+    if not folders:
         raise UserError(
             f"assets.root: {folder} holds no object; expected <id>/{URDFS[-1]} or <Category>/<id>/{URDFS[-1]} below it"
         )
-    return dict(sorted(found.items()))
+    return dict(sorted(folders.items()))
 
 
 def find_split_file(root: str | Path) -> Path | None:
@@ -72,7 +72,7 @@ def find_split_file(root: str | Path) -> Path | None:
 
 
 def _objects(folder: Path, depth: int) -> Iterator[Path]:
-    """Object folders; nothing is looked for inside one, where thousands of meshes and pictures lie."""
+    """Object folders. They are not searched themselves: each holds thousands of meshes and pictures."""
     if find_urdf(folder):
         yield folder
     elif depth:

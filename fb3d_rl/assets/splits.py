@@ -1,4 +1,4 @@
-"""Which objects train and which test.
+"""Which objects are for training and which for testing.
 
 UMPNet's lists (Xu, He, Song, RA-L 2022) are the reference: ``train_train`` (training instances of eleven categories),
 ``train_test`` (held-out instances of the same categories) and ``test`` (ten unseen categories).
@@ -56,7 +56,7 @@ def read_split(path: str | Path = UMPNET_SPLIT) -> dict[str, str]:
 def split_of(name: str, category: str, table: Mapping[str, str]) -> str:
     """Split of an object: by the table, else by its category and a stable hash of its id.
 
-    Objects of unseen categories are test objects; of the train categories one in five is held out.
+    Objects of unseen categories are test objects; one in five of the training categories is held out.
     """
     if name in table:
         return table[name]

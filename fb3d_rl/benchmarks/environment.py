@@ -25,7 +25,6 @@ from fb3d_rl.assets.partnet_mobility import load_objects
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import Key
-from fb3d_rl.data.samples import ObjectView
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
@@ -34,6 +33,7 @@ from fb3d_rl.rollout.collectors import CollectorOptions, Workers
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, limits_of, policy_env, run_trials, state_of
 from fb3d_rl.rollout.trials import Scheduled
+from fb3d_rl.scene.posed import Posed
 
 Progress = Callable[[str], None]
 
@@ -67,7 +67,7 @@ def expert_episodes(objects: Sequence[ArticulatedObject], options: EnvOptions) -
     episodes = []
     for seed, obj in enumerate(objects):
         trial = default_trial(obj, seed=seed)
-        env = policy_env(make_env([obj], options, [trial]))
+        env = policy_env(make_env([obj], options, [trial]), state_of(expert))
         with torch.no_grad():
             frames = env.rollout(options.horizon, expert)
         episodes.append(Episode(trial, frames["action"].reshape(-1, frames["action"].shape[-1])))
@@ -280,8 +280,8 @@ def reading(folders: Sequence[Path], progress: Progress) -> dict[str, Any]:
     progress(f"first look at {len(objects)} objects")
     start = time.perf_counter()
     for obj in objects:
-        view = ObjectView(obj, CameraOptions(resolution=8))
-        view.camera.capture(view.poses(view.closed).numpy(), View(azimuth=30.0, elevation=30.0))
+        posed = Posed(obj, CameraOptions(resolution=8))
+        posed.camera.capture(posed.poses(posed.closed), View(azimuth=30.0, elevation=30.0))
     return {
         "objects": len(objects),
         "first read, s": seconds[0],

@@ -26,11 +26,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.children import withheld
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import BACKBONES
-from fb3d_rl.training.fit import PRECISIONS, flow_loss, tune_cpu
+from fb3d_rl.scene.posed import Posed
+from fb3d_rl.training.device import tune_cpu
+from fb3d_rl.training.objective import flow_loss
+from fb3d_rl.training.options import PRECISIONS
 
 PEER = ("torch-geometric==2.7.0", "torch-cluster==1.6.3")
 """Later versions of PyTorch Geometric no longer call torch-cluster."""
@@ -98,10 +101,10 @@ def draw_clouds(objects: Sequence[ArticulatedObject], count: int, seed: int) -> 
         UserError: none of them shows a part that can be opened.
     """
     options = SampleOptions()
-    views = [ObjectView(obj, options.camera) for obj in objects[:count]]
+    posed = [Posed(obj, options.camera) for obj in objects[:count]]
     samples: list[TensorDictBase] = []
-    for number in range(4 * count if views else 0):
-        sample = draw_sample(views[number % len(views)], options, np.random.default_rng([seed, number]))
+    for number in range(4 * count if posed else 0):
+        sample = draw_sample(posed[number % len(posed)], options, np.random.default_rng([seed, number]))
         if sample is not None:
             samples.append(sample)
         if len(samples) == count:

@@ -11,48 +11,15 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.embree import EmbreeScene, triangle_scene
+from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import View, look_at, pixel_points, pixel_rays
 from fb3d_rl.kinematics.opening import standing_bounds
-
-
-@dataclass(frozen=True)
-class CameraOptions:
-    """A pinhole camera.
-
-    Attributes:
-        resolution: pixels along each side of the square image.
-        fov: full field of view, degrees.
-        margin: the closed object's bounding sphere fills 1 / margin of the field of view.
-        kind: what the simulated task sees with: "raycast" (this module) or "sapien", SAPIEN's renderer, which needs
-            Vulkan (:mod:`fb3d_rl.camera.sapien`). They see the same; flow samples for training always are "raycast".
-        shader: SAPIEN's shader pack, "minimal" (depth in whole millimetres, up to 32 m) or "default" (exact, slower).
-            Its ray tracers jitter their rays and blur depth over several pixels.
-    """
-
-    resolution: int = 96
-    fov: float = 40.0
-    margin: float = 1.15
-    kind: Literal["raycast", "sapien"] = "raycast"
-    shader: str = "minimal"
-
-    @property
-    def slope(self) -> float:
-        """Largest x / z and y / z in the image: at its edge."""
-        return math.tan(math.radians(0.5 * self.fov))
-
-    @property
-    def ticks(self) -> NDArray[np.float64]:
-        """Centres [resolution] of the pixels: x / z of the columns and y / z of the rows."""
-        return ((np.arange(self.resolution) + 0.5) / self.resolution * 2.0 - 1.0) * self.slope
-
 
 _LOW = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fb3d_rl.options import option
+
 
 @dataclass(frozen=True)
 class View:
@@ -23,8 +25,8 @@ class View:
 class ViewRange:
     """Ranges (degrees) that viewpoints are drawn from; equal ends fix the angle."""
 
-    azimuth: tuple[float, float] = (-45.0, 45.0)
-    elevation: tuple[float, float] = (15.0, 60.0)
+    azimuth: tuple[float, float] = option((-45.0, 45.0), "lowest and highest; 0 looks at the object's front", "degrees")
+    elevation: tuple[float, float] = option((15.0, 60.0), "lowest and highest, above the horizon", "degrees")
 
     def sample(self, rng: np.random.Generator) -> View:
         """Draw a view, uniformly in both angles."""

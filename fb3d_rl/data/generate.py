@@ -19,9 +19,10 @@ from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import content_of, load_object
 from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.data.picking import Index, pick
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
+from fb3d_rl.scene.posed import Posed
 
 if TYPE_CHECKING:  # takes seconds, which every worker process would wait
     from torchrl.data import ReplayBuffer
@@ -217,13 +218,13 @@ def _draw_object(
     """Draw the samples ``rows`` of one object into the memory map; return those that could not be drawn."""
     if not len(rows):
         return []
-    view = ObjectView(load_object(folder), options.camera)
-    if not view.openable:
+    posed = Posed(load_object(folder), options.camera)
+    if not posed.openable:
         return [int(row) for row in rows]
     table = TensorDict.load_memmap(rows_dir)
     missing = []
     for row in rows.tolist():
-        sample = draw_sample(view, options, np.random.default_rng([seed, 1, row]))
+        sample = draw_sample(posed, options, np.random.default_rng([seed, 1, row]))
         if sample is None:
             missing.append(row)
             continue

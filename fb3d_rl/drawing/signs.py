@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import ImageFont
 
 from fb3d_rl.assets.articulation import Mesh
-from fb3d_rl.drawing.shade import Color, srgb
+from fb3d_rl.drawing.bodies import Color, srgb
 
 FREE, HOLDING, FLOW = srgb("#e5383b"), srgb("#14c99a"), srgb("#ff8c1a")
 INK, FAINT, TRACK = "#22262b", "#6b7480", "#dfe4ea"

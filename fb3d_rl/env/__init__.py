@@ -2,3 +2,7 @@
 
 :mod:`fb3d_rl.env.options` needs no simulator; importing :mod:`fb3d_rl.env.task` loads SAPIEN and ManiSkill.
 """
+
+import warnings
+
+warnings.filterwarnings("ignore", message="Failed to find system libvulkan")  # SAPIEN's: most often nothing is rendered

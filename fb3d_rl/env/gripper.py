@@ -12,7 +12,9 @@ from mani_skill.agents.registration import register_agent
 from torch import Tensor
 
 from fb3d_rl.assets.gripper import TOOL, URDF
+from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.env.options import GripperOptions
+from fb3d_rl.errors import UserError
 
 JOINTS = ("x", "y", "z", "roll", "pitch", "yaw", "finger_left", "finger_right")
 """Joints in the order of actions, qpos and qvel."""
@@ -68,3 +70,18 @@ class FloatingSuctionGripper(BaseAgent):
         rows = np.array([np.concatenate([pose.p, pose.q]) for pose in poses], dtype=np.float32)
         rows[rows[:, 3] < 0, 3:] *= -1.0
         return torch.from_numpy(rows).to(self.device)
+
+
+def checked_action(action: Tensor, envs: int) -> Tensor:
+    """An action [E, 8] (or [8] with one environment) within [-1, 1].
+
+    Raises:
+        UserError: it has another shape, is not finite or out of range.
+    """
+    if action.shape not in ((envs, ACTION_DIM), (ACTION_DIM,) * (envs == 1)):
+        raise UserError(f"the action has shape {tuple(action.shape)}; give one of {(envs, ACTION_DIM)}")
+    # Rounding may leave the range by a little. Written so that nan fails too.
+    if not bool((action.abs() <= 1.0 + 1e-4).all()):
+        worst = action[~(action.abs() <= 1.0 + 1e-4)][0]
+        raise UserError(f"the action holds {float(worst):.6g}; velocities are numbers from -1 to 1")
+    return action.clamp(-1.0, 1.0)

@@ -3,44 +3,40 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.camera.raycast import CameraOptions
+from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.errors import UserError
-from fb3d_rl.kinematics.opening import openable_links, opening_range, start_fraction
+from fb3d_rl.options import group, option
+
+if TYPE_CHECKING:
+    from fb3d_rl.assets.articulation import ArticulatedObject
+
+
+Start = Literal["reference", "closed", "random"]
+"""How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""
 
 
 @dataclass(frozen=True)
 class GripperOptions:
-    """Limits and drives of the floating gripper.
+    """Limits and drives of the floating gripper."""
 
-    Attributes:
-        v_max: speed of each slide at action 1, m/s.
-        w_max: speed of each hinge at action 1, rad/s.
-        f_max: speed of each finger at action 1, m/s.
-        force_limit: largest force of a slide's drive, N.
-        torque_limit: largest torque of a hinge's drive, N m.
-        finger_force_limit: largest force of a finger's drive, N.
-        damping: velocity gain of the slides, N s/m: how hard they resist a velocity other than the commanded one.
-        angular_damping: velocity gain of the hinges, N m s/rad.
-        distance: distance (m) of the hand's origin in front of the object at the start.
-    """
-
-    v_max: float = 2.0
-    w_max: float = 3.0
-    f_max: float = 0.05
-    force_limit: float = 3000.0
-    torque_limit: float = 300.0
-    finger_force_limit: float = 100.0
-    damping: float = 10000.0
-    angular_damping: float = 200.0
-    distance: float = 0.6
+    v_max: float = option(2.0, "speed of each slide at action 1", "m/s")
+    w_max: float = option(3.0, "speed of each hinge at action 1", "rad/s")
+    f_max: float = option(0.05, "speed of each finger at action 1", "m/s")
+    force_limit: float = option(3000.0, "largest force of a slide's drive", "N")
+    torque_limit: float = option(300.0, "largest torque of a hinge's drive", "N m")
+    finger_force_limit: float = option(100.0, "largest force of a finger's drive", "N")
+    damping: float = option(
+        10000.0, "velocity gain of the slides: how hard they resist a velocity other than the commanded one", "N s/m"
+    )
+    angular_damping: float = option(200.0, "velocity gain of the hinges", "N m s/rad")
+    distance: float = option(0.6, "distance of the hand's origin in front of the object at the start", "m")
 
     def start(self, bounds: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where the hand's origin is at the start [3] (m), in front of an object within ``bounds`` [2, 3] (m).
@@ -52,68 +48,46 @@ class GripperOptions:
 
 @dataclass(frozen=True)
 class SuctionOptions:
-    """The spring that stands for suction (supplement, II.C: a strong force between gripper and part).
+    """The spring that stands for suction (supplement, II.C: a strong force between gripper and part)."""
 
-    Attributes:
-        hold: "target" holds the part to open only, "any" every movable part.
-        stiffness: of the spring between tip and part, N/m.
-        damping: of the spring, N s/m.
-        angular_damping: of the hand's free turning about the anchor, N m s/rad.
-        breaking_force: the spring's force (N) above which suction is lost.
-        max_stretch: the spring's length (m) above which suction is lost.
-        touch: two surfaces that are closer than this (m), or press on each other, touch.
-        reach: how far (m) from the tip's centre a finger may touch and still suck.
-    """
-
-    hold: Literal["target", "any"] = "target"
-    stiffness: float = 45000.0
-    damping: float = 3000.0
-    angular_damping: float = 1.0
-    breaking_force: float = math.inf
-    max_stretch: float = 0.06
-    touch: float = 0.002
-    reach: float = 0.05
+    hold: Literal["target", "any"] = option(
+        "target",
+        "what suction holds: the part to open only, or every movable part",
+        null="any where policy.mask is none, else target",
+    )
+    stiffness: float = option(45000.0, "of the spring between tip and part", "N/m")
+    damping: float = option(3000.0, "of the spring", "N s/m")
+    angular_damping: float = option(1.0, "of the hand's free turning about the anchor", "N m s/rad")
+    breaking_force: float = option(math.inf, "the spring's force above which suction is lost", "N")
+    max_stretch: float = option(0.06, "the spring's length above which suction is lost", "m")
+    touch: float = option(0.002, "two surfaces that are closer than this, or press on each other, touch", "m")
+    reach: float = option(0.05, "how far from the tip's centre a finger may touch and still suck", "m")
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """Options of the task.
+    """The simulated task: its camera, where that may stand, and starts of trials that the environment draws itself.
 
-    Attributes:
-        gripper: drives of the gripper.
-        suction: the suction spring.
-        camera: the depth camera.
-        views: where it may stand; trials that the environment draws have their view from here.
-        start: how far the part to open is open at the start of such trials: "reference" (20 % in some categories, else
-            closed), "closed" or "random" (up to 90 %).
-        points: number N of points of an observed cloud.
-        horizon: control steps after which an episode is truncated.
-        success: an episode succeeds below this normalized distance.
-        sim_freq: physics steps per second.
-        control_freq: control steps per second; divides ``sim_freq``.
-        gravity: whether gravity acts on the object (the gripper floats in any case). Off by default: PartNet-Mobility
-            objects span about 2 m, so a laptop's lid would weigh 90 kg.
-        joint_friction: PhysX's friction coefficient of the object's joints.
-        joint_damping: rate (1/s) at which a joint that nobody pushes loses its speed. It is per inertia, since parts
-            weigh from grams to 100 kg: light ones stay easy to open and heavy ones do not coast on after a push.
-        density: of the object's parts, kg/m^3. Parts are hollow, but their hulls are solid and overlap: at the density
-            of wood a wide drawer would weigh 600 kg.
+    ``points`` is the number N of points of an observed cloud.
     """
 
-    gripper: GripperOptions = field(default_factory=GripperOptions)
-    suction: SuctionOptions = field(default_factory=SuctionOptions)
-    camera: CameraOptions = field(default_factory=CameraOptions)
-    views: ViewRange = field(default_factory=ViewRange)
+    gripper: GripperOptions = group(GripperOptions)
+    suction: SuctionOptions = group(SuctionOptions)
+    camera: CameraOptions = CameraOptions()
+    views: ViewRange = ViewRange()
     start: Start = "reference"
     points: int = 1200
-    horizon: int = 150
-    success: float = 0.1
-    sim_freq: int = 100
-    control_freq: int = 20
-    gravity: bool = False
-    joint_friction: float = 0.1
-    joint_damping: float = 5.0
-    density: float = 100.0
+    horizon: int = option(150, "after which an episode is truncated", "control steps", "[1, inf)")
+    success: float = option(0.1, "normalized distance below which a part is open")
+    sim_freq: int = option(100, "physics steps per second", "Hz")
+    control_freq: int = option(20, "control steps per second; divides sim_freq", "Hz", "[1, inf)")
+    # PartNet-Mobility objects span about 2 m, so a laptop's lid would weigh 90 kg.
+    gravity: bool = option(False, "whether gravity acts on the object; the gripper floats in any case")
+    joint_friction: float = option(0.1, "PhysX's friction coefficient of the object's joints")
+    # Parts weigh from grams to 100 kg: light ones stay easy to open and heavy ones do not coast on after a push.
+    joint_damping: float = option(5.0, "rate at which a joint that nobody pushes loses its speed, per inertia", "1/s")
+    # Parts are hollow, but their hulls are solid and overlap: at the density of wood a wide drawer would weigh 600 kg.
+    density: float = option(100.0, "of the convex hulls of the object's parts; furniture is hollow", "kg/m^3")
 
 
 @dataclass(frozen=True)
@@ -136,9 +110,12 @@ class Trial:
     seed: int = 0
     goal: float | None = None
 
+    def cloud_rng(self, step: int = 0) -> np.random.Generator:
+        """Draws the cloud after so many control steps: one for each, so that a restored state sees the same again."""
+        return np.random.default_rng([self.seed, step])
 
-Start = Literal["reference", "closed", "random"]
-"""How far a part is open at the start: 20 % in some categories, else closed; closed; up to 90 %."""
+    def __str__(self) -> str:
+        return f"object {self.object}, link {self.link}, seed {self.seed}"
 
 
 def drawn_fraction(start: Start, rng: np.random.Generator) -> float | None:
@@ -169,6 +146,9 @@ def default_trial(
     Raises:
         UserError: nothing of the object can be opened.
     """
+    # Imports torch, which takes seconds that a configuration's checks do not have.
+    from fb3d_rl.kinematics.opening import openable_links, opening_range, start_fraction
+
     if link is None:
         links = openable_links(obj)
         if not links:

@@ -198,6 +198,18 @@ class Suction:
             self._drive.entity.remove_component(self._drive)
         self._drive, self.held = None, None
 
+    @property
+    def state(self) -> Vector:
+        """Number of the part that is held, -1 for none, and the anchors, [7]."""
+        return np.concatenate([[-1 if self.held is None else self.held], *self.anchors])
+
+    def restore(self, state: Vector) -> None:
+        """Go back to a :attr:`state` [7]."""
+        held, on_tool, on_part = np.split(state, [1, 4])
+        self.release()
+        if held[0] >= 0:
+            self.hold(int(held[0]), on_tool, on_part)
+
     def take_impulse(self) -> Vector:
         """Net contact impulse [3] on the gripper (N s, world) since the last call."""
         impulse, self._impulse = self._impulse, np.zeros(3)

@@ -12,30 +12,23 @@ Definitions
     are of the same trial if object, part and seeds are the same and the runs' settings of all that a key tells are.
 
 Intervals
-    As in :mod:`fb3d_rl.evaluation.tables`: an object is the unit, with all its trials, those of all seeds, since
+    As in :mod:`fb3d_rl.evaluation.intervals`: an object is the unit, with all its trials, those of all seeds, since
     several seeds on the same objects are no more objects. Differences are taken trial by trial between policies that
     ran the same trials, and objects are the unit likewise.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
-
 from fb3d_rl.evaluation import tables
+from fb3d_rl.evaluation.intervals import Means
 from fb3d_rl.evaluation.runs import Run, labels
-from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, EFFORT, SUCCESS, TRIAL, Means, Metric
-from fb3d_rl.files import write_text
+from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, SUCCESS, Metric
 from fb3d_rl.rollout.rows import TrialRow, policies
 
 METHOD = (
@@ -59,9 +52,6 @@ BASELINES = ("expert", "bc")
 """Policies that the others are compared with."""
 
 DIFFERENCES = (SUCCESS, CONTACT, DISTANCE)
-
-COLUMNS = ("policy", "seed", "split", "category", "metric", "value", "low", "high", "n")
-"""Columns of comparison.csv."""
 
 _NOT_COMPARED = ("seed", "resume")
 _MAX_KEYS = 3
@@ -346,175 +336,6 @@ def _nearest(entry: Entry, baselines: Sequence[Entry]) -> list[Entry]:
 
     known = {id(b): distance(b) for b in baselines if entry.rows.keys() & b.rows.keys()}
     return [b for b in baselines if known.get(id(b), math.inf) == min(known.values(), default=-1)]
-
-
-# --------------------------------------------------------------------------------------------------------- writing
-
-
-def write_csv(comparison: Comparison, path: Path) -> None:
-    """Write every number of the comparison as a tidy table with :data:`COLUMNS`.
-
-    ``seed``, ``split`` and ``category`` are "all" or one of theirs. ``metric`` is a key of
-    :data:`fb3d_rl.evaluation.tables.TRIAL` or :data:`~fb3d_rl.evaluation.tables.EFFORT`, with "_class_mean" the mean
-    over categories, with "_minus_<policy>" the paired difference, or "labels", "expert_share" or the key of
-    :data:`~fb3d_rl.evaluation.tables.DECISION`. ``low`` and ``high`` are the ends of the 95 % interval; ``n`` counts
-    the trials that have a value.
-    """
-    out = io.StringIO(newline="")
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for entry in comparison.entries:
-        writer.writerows(_csv_rows(entry))
-    for d in comparison.differences:
-        about = (d.entry.label, "all", "all", "all")
-        writer.writerows(_means_rows(about, d.metric.key, f"_minus_{d.baseline.label}", d.means, d.n, classes=True))
-    write_text(path, out.getvalue())
-
-
-_CsvRow = tuple[object, ...]
-
-
-def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
-    everything = list(entry.rows.values())
-    seeds: list[tuple[str, list[TrialRow]]] = [("all", everything)]
-    if len(entry.seeds) > 1:
-        seeds += [(str(seed), entry.of_seed(seed)) for seed in entry.seeds]
-    metrics = TRIAL + tuple(metric for metric in EFFORT if tables.counted(everything, metric))
-    for seed, of_seed in seeds:
-        for split, of_split in _parts(of_seed, "split"):
-            for category, rows in _parts(of_split, "category", single=True):
-                for metric in metrics:
-                    about = (entry.label, seed, split, category)
-                    n, measured = tables.counted(rows, metric), tables.measure(rows, metric)
-                    yield from _means_rows(about, metric.key, "", measured, n, classes=category == "all")
-    for key, values, total in (
-        ("labels", entry.facts("labels"), entry.labels),
-        ("expert_share", entry.facts("expert_share"), entry.expert_share),
-        (DECISION.key, entry.decision_times, entry.decision_ms),
-    ):
-        if total is not None:
-            yield (entry.label, "all", "all", "all", key, total, "", "", "")
-            for run, value in zip(entry.groups[0].runs if len(values) > 1 else [], values, strict=False):
-                yield (entry.label, run.seed, "all", "all", key, _plain(value), "", "", "")
-
-
-def _parts(rows: Sequence[TrialRow], field: str, single: bool = False) -> Iterator[tuple[str, list[TrialRow]]]:
-    """All rows, then those of each value of ``field``, which is left out if there is but one unless ``single``."""
-    yield "all", list(rows)
-    values = sorted({getattr(row, field) for row in rows})
-    for value in values if single or len(values) > 1 else []:
-        yield value, [row for row in rows if getattr(row, field) == value]
-
-
-def _means_rows(
-    about: tuple[str, str, str, str], key: str, suffix: str, found: Means, n: int, classes: bool
-) -> Iterator[_CsvRow]:
-    shown = [(key + suffix, found.instance, found.instance_ci95)]
-    if classes:
-        shown.append((f"{key}_class_mean{suffix}", found.class_, found.class_ci95))
-    for name, value, interval in shown:
-        yield (*about, name, _plain(value), *(interval or ("", "")), n)
-
-
-def _plain(value: float | None) -> object:
-    return "" if value is None else value
-
-
-# -------------------------------------------------------------------------------------------------------- printing
-
-
-def cells(entry: Entry, numbers: Mapping[str, Any], metric: Metric, suffix: str = "") -> tuple[str, str]:
-    """An entry's value and interval for people; ``numbers`` is a comparison's or one of its splits'."""
-    key = f"{entry.label}/{metric.key}{suffix}"
-    return metric.show(numbers.get(key)), metric.show_interval(numbers.get(f"{key}_ci95"))
-
-
-def show_seeds(entry: Entry) -> str:
-    """Seeds for people: "0, 2", "0–9"."""
-    known = [seed for seed in entry.seeds if seed is not None]
-    if len(known) > 3 and known == list(range(known[0], known[-1] + 1)):
-        return f"{known[0]}–{known[-1]}"
-    return ", ".join(map(str, known)) or "–"
-
-
-def show_labels(value: float | None) -> str:
-    """A number of labels for people."""
-    return "–" if value is None else f"{value:,.0f}"
-
-
-def show_share(value: float | None) -> str:
-    """A share in percent for people."""
-    return "–" if value is None else f"{100 * value:.0f} %"
-
-
-def show_difference(metric: Metric, found: Means) -> tuple[str, str]:
-    """A signed difference and its interval for people; percentages differ by points."""
-    if found.instance is None:
-        return "–", ""
-
-    def signed(value: float) -> str:
-        shown = f"{100 * value:+.0f}" if metric.percent else f"{value:+.2f}"
-        return shown.replace("-", "\N{MINUS SIGN}") if float(shown) else shown[1:]
-
-    interval = found.instance_ci95
-    return signed(found.instance), "" if interval is None else f"{signed(interval[0])} to {signed(interval[1])}"
-
-
-def show(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the comparison, 100 columns wide where the output is not a terminal."""
-    console = console or Console()
-    if not console.is_terminal:
-        console.width = max(console.width, 100)
-    for table in _tables(comparison):
-        console.print(table)
-
-
-def _table(title: str, *columns: tuple[str, bool]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for name, number in columns:
-        table.add_column(name, justify="right" if number else "left", overflow="fold")
-    return table
-
-
-def _tables(comparison: Comparison) -> Iterator[Table]:
-    splits: dict[str, Mapping[str, Any]] = {"": comparison.numbers, **comparison.numbers.get("by_split", {})}
-    names = ("seeds", "n", "contact", "success", "95 %", "over seeds", "class", "dist.", "labels", "expert")
-    for split, numbers in splits.items():
-        title = f"Comparison, {split}" if split else "Comparison"
-        table = _table(title, ("policy", False), *((name, True) for name in names))
-        for entry in comparison.entries:
-            if f"{entry.label}/n" not in numbers:
-                continue
-            spread = None if split else entry.seed_range(SUCCESS)
-            success, interval = cells(entry, numbers, SUCCESS)
-            table.add_row(
-                entry.label,
-                show_seeds(entry),
-                str(numbers[f"{entry.label}/n"]),
-                cells(entry, numbers, CONTACT)[0],
-                success,
-                interval,
-                SUCCESS.show_interval(spread),
-                cells(entry, numbers, SUCCESS, "_class_mean")[0],
-                cells(entry, numbers, DISTANCE)[0],
-                show_labels(entry.labels),
-                show_share(entry.expert_share),
-            )
-        if table.row_count:
-            yield table
-    measured = tables.effort_of(comparison.numbers, [entry.label for entry in comparison.entries])
-    if measured:
-        yield tables.effort_table(comparison.numbers, measured)
-    table = _table(
-        "Differences on the same trials (success and contact in points)",
-        ("policy", False), ("minus", False), ("n", True), ("success", True), ("95 %", True), ("contact", True),
-        ("95 %", True), ("dist.", True), ("95 %", True),
-    )  # fmt: skip
-    for three in by_pair(comparison):
-        shown = (cell for d in three for cell in show_difference(d.metric, d.means))
-        table.add_row(three[0].entry.label, three[0].baseline.label, str(three[0].n), *shown)
-    if table.row_count:
-        yield table
 
 
 def by_pair(comparison: Comparison) -> list[list[Difference]]:

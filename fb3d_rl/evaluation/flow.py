@@ -12,10 +12,11 @@ from tensordict import TensorDict, TensorDictBase, lazy_stack
 from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.rollout.rows import FlowRow
+from fb3d_rl.scene.posed import Posed
 
 TARGETS = ("part", "all")
 
@@ -38,14 +39,14 @@ def held_out_samples(
     """
     drawn: dict[str, tuple[list[TensorDict], list[tuple[ArticulatedObject, str, str]]]] = {t: ([], []) for t in targets}
     for obj, split in objects:
-        view = ObjectView(obj, options.camera)
-        if not view.openable:
+        posed = Posed(obj, options.camera)
+        if not posed.openable:
             continue
         for target in targets:
             wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0)
             for number in range(count):
                 rng = np.random.default_rng([seed, 4, zlib.crc32(obj.id.encode()), number])
-                sample = draw_sample(view, wanted, rng)
+                sample = draw_sample(posed, wanted, rng)
                 if sample is not None:
                     drawn[target][0].append(sample)
                     link = "*" if target == "all" else obj.links[int(sample["target"])].name

@@ -11,8 +11,9 @@ from typing import Any
 from fb3d_rl.assets.splits import UMPNET_SPLIT
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
+from fb3d_rl.evaluation.intervals import Interval, Means
 from fb3d_rl.evaluation.runs import Run
-from fb3d_rl.evaluation.tables import FLOW, MOTION_ONLY, SUCCESS, Interval, Means, Metric, counted, measure
+from fb3d_rl.evaluation.tables import FLOW, MOTION_ONLY, SUCCESS, Metric, counted, measure
 from fb3d_rl.rollout.rows import FlowRow, TrialRow, policies
 
 PUBLISHED: dict[str, Any] = json.loads(Path(__file__).with_name("published.json").read_text())

@@ -41,8 +41,8 @@ def squared_distances(points: Tensor, others: Tensor) -> Tensor:
 def farthest_point_sample(points: Tensor, count: int, valid: Tensor | None = None) -> Tensor:
     """Pick ``count`` points that cover each cloud (Eldar et al. 1997).
 
-    Deterministic: starts at the first valid point, and a tie goes to the lower index. Where a cloud has fewer
-    than ``count`` distinct valid points, valid points repeat; a cloud with none gives index 0.
+    Deterministic: starts at the first valid point, and of equally far points the lower index wins. Where a cloud has
+    fewer than ``count`` distinct valid points, valid points repeat; a cloud with none gives index 0.
 
     Args:
         points: [B, N, 3].
@@ -99,17 +99,17 @@ def ball_query(
     """
     valid = _all_valid(points, valid)
     batch, rows = centres.shape[:2]
-    found = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
+    inside_so_far = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
     # One cloud at a time on a CPU, so that its distances stay in the cache.
     size = 1 if points.device.type == "cpu" else batch
     for start in range(0, batch, size):
         part = slice(start, start + size)
         inside = squared_distances(centres[part], points[part]) <= radius * radius
-        torch.cumsum(inside & valid[part, None], 2, dtype=torch.int32, out=found[part])
-    # The k-th neighbour is where the count of those found so far first reaches k.
+        torch.cumsum(inside & valid[part, None], 2, dtype=torch.int32, out=inside_so_far[part])
+    # The k-th neighbour is the point at which the number of points inside first reaches k.
     rank = torch.arange(1, count + 1, dtype=torch.int32, device=points.device).repeat(batch, rows, 1)
-    mask = rank <= found[..., -1:]
-    index = torch.searchsorted(found, rank)
+    mask = rank <= inside_so_far[..., -1:]
+    index = torch.searchsorted(inside_so_far, rank)
     first = index[..., :1] * mask[..., :1]
     return torch.where(mask, index, first), mask
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from fb3d_rl.geometry.transforms import axis_angle_to_matrix, normalize, skew
 
 LOCAL = 0.1
-"""Distance (m) at which a point counts a quarter of one at the place itself in :func:`local_weight`."""
+"""Distance (m) at which :func:`local_weight` gives a quarter of the weight at the place itself."""
 
 
 def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge: float) -> tuple[Tensor, Tensor]:
@@ -22,7 +22,7 @@ def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge
         flow: [B, N, 3] displacement or velocity of each point.
         weight: [B, N] non-negative weights; a cloud whose weights are all 0 has no motion.
         at: [B, 3] m.
-        ridge: added to the moments of inertia (m^2), so that omega does not run away where points lie in a row.
+        ridge: added to the moments of inertia (m^2), so that omega stays small where all points are on a line.
 
     Returns:
         v [B, 3] in the unit of the flow and omega [B, 3] in that unit per m.
@@ -42,9 +42,9 @@ def rigid_motion(points: Tensor, flow: Tensor, weight: Tensor, at: Tensor, ridge
 
 
 def local_weight(flow: Tensor, squared: Tensor) -> Tensor:
-    """Weights [..., N] for the motion of what moves at a place, where no mask tells one part from another.
+    """Weights [..., N] to fit the motion at a place where no mask separates the parts.
 
-    What moves more counts more, and what is near much more than what is farther away than ``LOCAL``.
+    Points that move more count more, and near points much more than those farther away than ``LOCAL``.
 
     Args:
         flow: [..., N, 3] of each point, 0 where a point does not count.

@@ -17,6 +17,45 @@ def normalize(vectors: Tensor, eps: float = 1e-12) -> Tensor:
     return torch.where(norm > eps, vectors / norm.clamp_min(eps), 0.0)
 
 
+def dot(a: Tensor, b: Tensor) -> Tensor:
+    """Inner products [..., 1] of vectors [..., D]."""
+    return (a * b).sum(-1, keepdim=True)
+
+
+def length(vectors: Tensor) -> Tensor:
+    """Euclidean norms [..., 1] of vectors [..., D]."""
+    return torch.linalg.vector_norm(vectors, dim=-1, keepdim=True)
+
+
+def alignment(source: Tensor, target: Tensor) -> Tensor:
+    """Rotation vectors [..., 3] (rad) of the shortest rotations that take ``source`` to ``target`` [..., 3].
+
+    Supplement I.F with two corrections: the angle is ``phi_12`` about the *unit* axis ``v1 x v2 / |v1 x v2|`` (the text
+    halves ``omega`` in place of ``phi_12`` and leaves the axis unnormalised), and opposite vectors turn by pi about an
+    axis perpendicular to both, where the cross product vanishes. ``phi_12`` is taken by atan2, which unlike arccos is
+    accurate near 0 and pi. A zero vector aligns with anything: rotation 0.
+    """
+    a, b = normalize(source), normalize(target)
+    axis = torch.linalg.cross(a, b)
+    sine, cosine = length(axis), dot(a, b)
+    turn = axis * (torch.atan2(sine, cosine) / sine.clamp_min(1e-7))
+    parallel = sine <= 1e-7
+    if not bool(parallel.any()):
+        return turn
+    # Perpendicular to a: cross with the coordinate axis along which a is shortest.
+    shortest = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a)
+    half_turn = torch.pi * normalize(torch.linalg.cross(a, shortest))
+    return torch.where(parallel, torch.where(cosine >= 0.0, 0.0, half_turn), turn)
+
+
+def rotate(vectors: Tensor, rotation: Tensor) -> Tensor:
+    """Turn vectors [..., 3] by rotation vectors [..., 3] (rad): Rodrigues' formula."""
+    angle = length(rotation)
+    axis = normalize(rotation)
+    once = torch.linalg.cross(axis, vectors)
+    return vectors + torch.sin(angle) * once + (1.0 - torch.cos(angle)) * torch.linalg.cross(axis, once)
+
+
 def skew(vectors: Tensor) -> Tensor:
     """Cross-product matrices [..., 3, 3] of vectors [..., 3]: ``skew(a) @ b == a x b``."""
     x, y, z = vectors.unbind(-1)

@@ -20,7 +20,7 @@ class JointScrew(NamedTuple):
     Attributes:
         revolute: [B] bool; else prismatic.
         axis: [B, 3] unit direction of sliding, or of turning (right-hand rule), the way that opens.
-        origin: [B, 3] a point on the axis of turning, m; of no meaning where a part slides.
+        origin: [B, 3] a point on the axis of turning, m; meaningless where a part slides.
     """
 
     revolute: Tensor
@@ -47,9 +47,9 @@ def screw_of_flow(points: Tensor, flow: Tensor, part: Tensor) -> tuple[JointScre
         part: [B, N] bool, the part's points.
 
     Returns:
-        The screw, its origin the axis' nearest point to the part's mean; and what its flow does not explain [B], the
-        root mean square of its error: near 0 for one part, large where parts that move by different joints are taken
-        for one. A cloud without flow has an axis of 0.
+        The screw, its origin the axis' nearest point to the part's mean; and the root mean square [B] of its flow's
+        error: near 0 for one part, large where the points belong to parts that move by different joints. A cloud
+        without flow has an axis of 0.
     """
     weight = part.to(points.dtype)
     count = weight.sum(1, keepdim=True).clamp_min(1.0)
@@ -63,5 +63,5 @@ def screw_of_flow(points: Tensor, flow: Tensor, part: Tensor) -> tuple[JointScre
     nearest = torch.linalg.cross(omega, velocity) / omega.square().sum(-1, keepdim=True).clamp_min(1e-12)
     axis = normalize(torch.where(revolute[:, None], omega, velocity))
     screw = JointScrew(revolute, axis, centre + nearest * revolute[:, None])
-    left = flow_of_screw(screw, points, part) - flow
-    return screw, (left.square().sum((1, 2)) / count.squeeze(1)).sqrt()
+    error = flow_of_screw(screw, points, part) - flow
+    return screw, (error.square().sum((1, 2)) / count.squeeze(1)).sqrt()

@@ -38,21 +38,6 @@ def link_corners(link: Link) -> NDArray[np.float64]:
     return np.array([[bounds[c[i], i] for i in range(3)] for c in itertools.product((0, 1), repeat=3)])
 
 
-def box_corners(obj: ArticulatedObject) -> NDArray[np.float64]:
-    """Corners [L, 8, 4] (homogeneous, in its frame) of each link's bounding box; nan for a link without a mesh."""
-    corners = np.full((len(obj.links), 8, 4), np.nan)
-    for row, link in zip(corners, obj.links, strict=True):
-        if link.visuals:
-            row[:, :3], row[:, 3] = link_corners(link), 1.0
-    return corners
-
-
-def box_bounds(corners: NDArray[np.float64], poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bounds [2, 3] (m) of the links' bounding boxes, :func:`box_corners`, at the links' poses [L, 4, 4]."""
-    points = (corners @ poses.swapaxes(1, 2))[..., :3].reshape(-1, 3)
-    return np.stack([np.nanmin(points, 0), np.nanmax(points, 0)])
-
-
 def _bounds(
     obj: ArticulatedObject, tree: KinematicTree, qpos: NDArray[np.float64], links: Iterable[int]
 ) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ class KinematicTree:
         joint_index: position of each link's joint in a joint state, -1 for a fixed joint and the root.
         prismatic: whether each link's joint slides.
         movable: the link of each joint of a joint state [J], int64.
-        descendants: [J, L] bool, the links that joint j moves (its own link and all that it carries).
+        descendants: [J, L] bool, the links that joint j moves (its own link and all links below it).
     """
 
     parents: tuple[int, ...]

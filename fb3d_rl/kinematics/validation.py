@@ -19,7 +19,7 @@ from fb3d_rl.kinematics.opening import openable_links, opening_range
 from fb3d_rl.kinematics.tree import KinematicTree
 
 SAMPLES = 400
-"""Points of a part's surface that are followed while it opens."""
+"""Number of points on a part's surface whose motion is followed while it opens."""
 
 DEPTH = 0.01
 """How deep (m) a point must be inside another part's hull to count."""
@@ -28,7 +28,7 @@ BLOCKED = 0.15
 """Share of a part's points that must get into others for the part to count as blocked."""
 
 SHARES = (0.03, 0.1, 0.25, 0.5, 0.75)
-"""How far the part is open where that is looked at."""
+"""How far the part is open in the states that are checked, as a share of its range."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Finding:
 
     Attributes:
         what: a sentence.
-        serious: whether the object, or a part of it, cannot be used because of it; else it is only to be known.
+        serious: whether the object, or a part of it, cannot be used because of it; else it is only worth knowing.
     """
 
     what: str
@@ -70,7 +70,7 @@ class Verdict:
 
 
 def examine(folder: Path) -> Verdict:
-    """The verdict on an object's folder; an object that cannot be read has that as its flaw."""
+    """The verdict on an object's folder; that an object cannot be read is a flaw too."""
     try:
         obj = load_object(folder)
     except UserError as error:
@@ -80,12 +80,12 @@ def examine(folder: Path) -> Verdict:
 
 def findings(obj: ArticulatedObject) -> list[Finding]:
     """The flaws of an object that could be read, the serious ones first."""
-    found = [*_joints(obj), *_surfaces(obj), *_blocked(obj)]
-    found += [
+    flaws = [*_joints(obj), *_surfaces(obj), *_blocked(obj)]
+    flaws += [
         Finding(f"{'left out' if what in obj.lost else 'noted'} while reading: {what}", serious=False)
         for what in obj.dropped
     ]
-    return sorted(found, key=lambda finding: not finding.serious)
+    return sorted(flaws, key=lambda finding: not finding.serious)
 
 
 def _joints(obj: ArticulatedObject) -> Iterable[Finding]:
@@ -117,8 +117,8 @@ def _surfaces(obj: ArticulatedObject) -> Iterable[Finding]:
 def _blocked(obj: ArticulatedObject) -> Iterable[Finding]:
     """Parts that get into others while they open: from a wrong axis, or an overlap at rest.
 
-    A part is as free as the hulls of the others' meshes say; where it is in one of these at rest already, as a door is
-    in its frame, that one does not count.
+    The other parts are replaced by the hulls of their meshes. A hull that the part is inside of when closed, as a door
+    is in its frame, does not count.
     """
     openable = openable_links(obj)
     if not openable:
@@ -155,8 +155,8 @@ def _samples(meshes: list[tuple[int, Mesh]]) -> list[tuple[int, NDArray[np.float
     count, samples = max(3, SAMPLES // len(meshes)), []
     for i, mesh in meshes:
         solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-        found, _ = trimesh.sample.sample_surface(solid, count, seed=0)
-        samples.append((i, np.asarray(found)))
+        points, _ = trimesh.sample.sample_surface(solid, count, seed=0)
+        samples.append((i, np.asarray(points)))
     return samples
 
 

@@ -23,8 +23,9 @@ import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import Mesh
+from fb3d_rl.assets.gripper import gripper_meshes
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.drawing.shade import GRIPPER, Color, link_colors, srgb
+from fb3d_rl.drawing.bodies import GRIPPER, Color, link_colors, srgb
 from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
@@ -291,7 +292,7 @@ class Page:
         links = len(self._session.obj.links)
         acting = len(moment.poses) > links
         if acting and len(self._bodies) == links:
-            meshes = self._session.gripper
+            meshes = gripper_meshes()
             self._bodies += [self._mesh(f"/gripper/{i}", mesh, GRIPPER) for i, mesh in enumerate(meshes)]
         elif not acting and len(self._bodies) > links:
             for body in self._bodies[links:]:
@@ -299,7 +300,7 @@ class Page:
             del self._bodies[links:]
         held = moment.trial.attached if moment.trial is not None else None
         if acting and held != self._held:
-            self._cup = self._mesh("/gripper/0/cup", [cup_mesh(self._session.gripper)], HOLDING if held else FREE)
+            self._cup = self._mesh("/gripper/0/cup", [cup_mesh(gripper_meshes())], HOLDING if held else FREE)
         self._held = held
         for body, pose in zip([*self._bodies, self._camera], [*moment.poses, moment.camera], strict=True):
             if body is not None:

@@ -6,9 +6,8 @@ Nothing here knows of a page; the simulator is loaded when a trial begins.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import torch
@@ -18,22 +17,25 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import step_mdp
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.gripper import TIP
 from fb3d_rl.camera.views import View
-from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions, flow_sample
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.flow.metrics import flow_metrics
-from fb3d_rl.kinematics.opening import box_bounds, box_corners
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.contact import Contact as Touch
 from fb3d_rl.policies.contact import choose_contact
-from fb3d_rl.policies.flow_policy import APPROACH, PHASES, PULL, SELECT, TRAVEL, FlowPolicy, FlowPolicyOptions
+from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
+from fb3d_rl.policies.flow_state import APPROACH, PHASES, PULL, SELECT, TRAVEL
 from fb3d_rl.policies.hand import hand_axis
-from fb3d_rl.rollout.run import limits_of, policy_env
+from fb3d_rl.rollout.run import limits_of, policy_env, state_of
 from fb3d_rl.rollout.trials import schedule
+from fb3d_rl.scene.observer import observe
+from fb3d_rl.scene.posed import Posed
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
@@ -135,7 +137,7 @@ class Session:
     ) -> None:
         self.obj = obj
         self.flows = [name for name in FLOWS if name == "true" or net is not None]
-        self._object = ObjectView(obj, samples.camera)
+        self._object = Posed(obj, samples.camera)
         self._env_options, self._policy_options = env, policy
         self._net, self._device = net, device or torch.device("cpu")
         self._env: EnvBase | None = None
@@ -160,7 +162,7 @@ class Session:
             raise UserError(f"there is no {name} flow without a network; give its weights: checkpoint=PATH")
         self.flow = name
         self._policy = FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options)
-        self._picked: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._picked: tuple[Touch, Touch] | None = None
 
     def set_part(self, link: int) -> None:
         """Choose the part to open, with the joint state and the view that an evaluation would start from."""
@@ -243,34 +245,32 @@ class Session:
         others = torch.ones_like(obs["valid"])
         others[0, row] = False
         picked = self._choose(others)
-        if not torch.equal(picked[0][0], obs["points"][0, row]):
+        if not torch.equal(picked[0].point[0], obs["points"][0, row]):
             raise UserError(
                 f"the {self.flow} flow there is {float(norm[row]):.2f}, too little to pull along; "
                 "pick a point that moves"
             )
         self._picked = picked
         if self.trial is not None:
-            self._policy.send(self._frame["policy"], obs, picked)
+            self._policy.go_to(self._frame, *picked)
         self.moment = self._moment()
 
     # ------------------------------------------------------------------------------------------------- what is seen
 
     def _look(self) -> None:
         """See the object as it stands at the start of the trial, without the simulator."""
-        trial, object_view = self._trial, self._object
-        qpos = np.array(trial.start)
-        # The generator of a trial's first cloud, so that it is the same one.
-        points, links = object_view.cloud(qpos, trial.view, self._points, np.random.default_rng([trial.seed, 0]))
-        frame = object_view.sample(links, points, qpos, trial.link)[None]
-        poses = object_view.poses(qpos).numpy()
-        tip = self._env_options.gripper.start(box_bounds(box_corners(self.obj), poses)) + [TIP, 0, 0]
+        trial, posed = self._trial, self._object
+        poses = posed.poses(trial.start)
+        cloud = observe(posed, poses, trial.view, self._points, trial.cloud_rng())
+        frame = flow_sample(cloud, trial.link)[None]
+        tip = self._env_options.gripper.start(posed.bounds(trial.start)) + [TIP, 0, 0]
         frame["observation", "tool_pose"] = torch.tensor([[*tip, 1, 0, 0, 0]], dtype=torch.float32)
-        camera = object_view.camera.pose(trial.view)[:3, 3]
+        camera = posed.camera.pose(trial.view)[:3, 3]
         frame["observation", "camera_position"] = torch.tensor(camera[None], dtype=torch.float32)
         self.trial: Progress | None = None
         self._picked = None
         self._frame = self._predicted(frame)
-        self._poses, self._qpos = poses, qpos
+        self._poses, self._qpos = poses, np.array(trial.start)
         self.moment = self._moment()
 
     def _predicted(self, frame: TensorDictBase) -> TensorDictBase:
@@ -302,7 +302,8 @@ class Session:
         """Where the policy touches, or would if it began now."""
         phase = SELECT if self.trial is None else PHASES.index(self.trial.phase)
         if phase == SELECT:
-            point, pull, standoff, _ = self._picked or self._choose()
+            touch = (self._picked or self._choose())[0]
+            point, pull, standoff = touch.point, touch.flow, touch.standoff
         elif phase in (TRAVEL, APPROACH, PULL):
             point, pull, standoff = (self._frame["policy", key] for key in ("contact_point", "pull", "standoff"))
             if phase == PULL:
@@ -316,7 +317,7 @@ class Session:
         obs = self._frame["observation"]
         return obs["valid"] if self._policy_options.mask == "none" else obs["valid"] & obs["part_mask"]
 
-    def _choose(self, avoid: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _choose(self, avoid: Tensor | None = None) -> tuple[Touch, Touch]:
         """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
         obs, options = self._frame["observation"], self._policy_options.contact
         shown = self._shown()
@@ -360,11 +361,11 @@ class Session:
         require_simulator("look at flow and contact points alone")
         if self._base is None or self._env is None:
             self._base = make_env([self.obj], self._env_options)
-            self._env = policy_env(self._base)
+            self._env = policy_env(self._base, state_of(self._policy))
         self._base.set_trials([self._trial])
         frame = self._env.reset()
         if self._picked is not None:
-            self._policy.send(frame["policy"], frame["observation"], self._picked)
+            self._policy.go_to(frame, *self._picked)
         self._seen(frame, False)
 
     def _seen(self, frame: TensorDictBase, over: bool) -> None:
@@ -389,13 +390,6 @@ class Session:
     def loaded(self) -> bool:
         """Whether the simulator is there already."""
         return self._base is not None
-
-    @property
-    def gripper(self) -> Sequence[Sequence[Mesh]]:
-        """Meshes of hand, left and right finger, each in its own frame; once a trial has begun."""
-        assert self._base is not None
-        task: Any = self._base.env
-        return task.stages[0].model.gripper
 
     def close(self) -> None:
         """Free the simulator."""

@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.places import folder
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])
 
 POINTS = 1200
 """Points of the clouds that networks are trained on (contract), so that balls hold as many as they did then."""
 
-PRETRAINED = Path(__file__).resolve().parents[2] / "results" / "pretrained" / "artflownet.safetensors"
+PRETRAINED = folder("pretrained") / "artflownet.safetensors"
 """The weights that this project publishes."""
 
 

@@ -1,1 +1,1 @@
-"""From depth points to the cloud that policies see, and from a flow to the point to touch."""
+"""From a depth camera's points to the cloud that policies see."""

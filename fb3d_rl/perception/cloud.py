@@ -5,9 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-MIN_VISIBLE = 20
-"""A part with fewer points in the cloud counts as not visible."""
-
 
 def sample_cloud(
     points: NDArray[np.float64], links: NDArray[np.int64], count: int, rng: np.random.Generator

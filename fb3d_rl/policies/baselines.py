@@ -11,10 +11,11 @@ from fb3d_rl.geometry.points import knn, pca_curvature
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import uniform
+from fb3d_rl.policies.policy import Policy
 
 
-class RandomPolicy(TensorDictModuleBase):
-    """Actions that are uniform in [-1, 1] and depend on the trial's seed and the step alone; what luck opens.
+class RandomPolicy(Policy):
+    """Actions that are uniform in [-1, 1] and depend on the trial's seed and the step alone: the lower bound.
 
     Shapes: reads the trial's "seed" and "elapsed_steps" [E, 1]; writes "action" [E, 8].
     """
@@ -57,10 +58,15 @@ class NormalFlow(TensorDictModuleBase):
         return tensordict
 
 
+def random_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> RandomPolicy:
+    """What luck opens; limits and options say nothing to it."""
+    return RandomPolicy()
+
+
 def normal_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> TensorDictSequential:
     """The flow policy fed with surface normals.
 
-    The paper's "Normal Direction" is told the point of largest true flow; this one chooses its contact point as any
+    The paper's "Normal Direction" is given the point of largest true flow; this one chooses its contact point as any
     flow policy does, so that it needs nothing privileged.
     """
     options = options or FlowPolicyOptions()

@@ -1,74 +1,64 @@
-"""Where to touch: the contact-point heuristic (supplement, I.E and I.F) with a check that the hand can get there."""
+"""Where to touch: the contact-point heuristic (supplement, I.E and I.F) with a check that the hand can get there.
+
+Of the points with at least ``min_flow`` of the largest flow the one that is worth most, foremost the nearest to the
+hand, is taken if it is a good place for a suction cup: the surface is flat around it (PCA curvature), it is no rim of
+the part, the hand can come and go along with it, and it was not tried before. (The supplement takes the largest flow;
+where several points have nearly that, small differences send the hand now here, now there, and no learner can follow.)
+Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is good, the demands are dropped one
+after the other. The hand comes against the flow (I.F). Where the flow runs along the surface, as on a sliding sash, or
+into it, it comes against the surface's normal instead; where something stands in the way, along the normal or the line
+of sight, which is free as far as the camera sees.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
+from tensordict import TensorClass
 from torch import Tensor
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.geometry.points import gather, pca_curvature, squared_distances
 from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion, screw
 from fb3d_rl.geometry.transforms import normalize
+from fb3d_rl.policies.options import ContactOptions
 
 CANDIDATES = 64
 """Points of a cloud that are remembered as candidates."""
 
-LAYOUT = (3, 3, 3, 1)
-"""What a candidate consists of: its point (m), unit flow and standoff, and its share of the cloud's largest flow."""
 
-CANDIDATE = sum(LAYOUT)
+class Contact(TensorClass):
+    """Where and how the hand may touch in B clouds: at one point each, or at any of K candidates.
 
-
-@dataclass(frozen=True)
-class ContactOptions:
-    """Thresholds of the contact-point heuristic.
+    All of it is 0 where there is nothing to touch.
 
     Attributes:
-        neighbors: points that make a neighbourhood.
-        curvature: PCA curvature above which a point is no good place for a suction cup.
-        rim: a point whose neighbours on the part lie to one side is on its rim: largest distance from the point to
-            their mean, as a share of their mean distance.
-        min_distance: where the max-flow point is discarded, its stand-in is at least this far away (I.E), m.
-        min_flow: share of the cloud's largest flow that a contact point must have.
-        near: what a metre from the hand counts against a point, in shares of the largest flow. The larger, the
-            more the choice depends on where the hand is, and the less on which points the camera happens to see; with
-            0 here and in ``turning`` it is the supplement's: the largest flow (I.E).
-        turning: what it counts against a point that the hand has to turn to stand off it, for 1 - cosine of the angle.
-        facing: cosine between flow and surface normal below which the hand approaches along the normal.
-        collisions: whether the hand's way to the point, and with the part from there, has to be free of the cloud and
-            the ground. Without it the supplement's rule is left: what is flat is good.
-        hand_radius: radius (m) of the free cylinder that the hand needs in front of the point.
-        clearance: where that cylinder starts, in front of the point, m.
-        reach: where that cylinder ends, m.
-        run_up: straight way (m) that the tip needs above the ground before it touches.
-        weak_flow: share of the largest flow that does if no point with more can be moved freely.
-        candidates: points whose way along the flow is checked.
-        sweep: how far along its way a point has to be free, m; ``sweep_angle`` (rad) if that is less.
-        sweep_steps: places along the way that are checked.
+        point: [B, 3] or [B, K, 3] world, m.
+        flow: [B, 3] or [B, K, 3] unit flow there.
+        standoff: [B, 3] or [B, K, 3] unit direction in which the hand stands off the point.
+        share: [B, 1] or [B, K, 1] size of the flow there, as a share of the cloud's largest.
     """
 
-    neighbors: int = 12
-    curvature: float = 0.03
-    rim: float = 0.45
-    min_distance: float = 0.02
-    min_flow: float = 0.5
-    near: float = 10.0
-    turning: float = 1.0
-    facing: float = 0.35
-    collisions: bool = True
-    hand_radius: float = 0.055
-    clearance: float = 0.06
-    reach: float = 0.6
-    run_up: float = 0.1
-    weak_flow: float = 0.1
-    candidates: int = 64
-    sweep: float = 1.0
-    sweep_angle: float = 1.6
-    sweep_steps: int = 8
+    point: Tensor
+    flow: Tensor
+    standoff: Tensor
+    share: Tensor
+
+    @classmethod
+    def none(cls, batch: Sequence[int], like: Tensor | None = None) -> Contact:
+        """No candidates, K = CANDIDATES rows of zeros, on the device of ``like``."""
+        shape, device = (*batch, CANDIDATES), None if like is None else like.device
+        vectors = {key: torch.zeros(*shape, 3, device=device) for key in ("point", "flow", "standoff")}
+        return cls(**vectors, share=torch.zeros(*shape, 1, device=device), batch_size=torch.Size(batch))
+
+    def at(self, index: Tensor) -> Contact:
+        """Of the candidates of each cloud the one at ``index`` [B]."""
+        rows = torch.arange(len(index), device=index.device)
+        return self.apply(lambda x: x[rows, index])
 
 
 def choose_contact(
@@ -81,17 +71,8 @@ def choose_contact(
     axis: Tensor,
     avoid: Tensor,
     options: ContactOptions,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Choose where to touch each cloud and from which side.
-
-    Of the points with at least ``min_flow`` of the largest flow the one that is worth most, foremost the nearest to
-    the hand, is taken if it is a good place for a suction cup: the surface is flat around it (PCA curvature), it is no
-    rim of the part, the hand can come and go along with it, and it was not tried before. (The supplement takes the
-    largest flow; where several points have nearly that, small differences send the hand now here, now there, and no
-    learner can follow.) Otherwise the nearest good point at least 2 cm from it is (I.E); where no point is
-    good, the demands are dropped one after the other. The hand comes against the flow (I.F). Where the flow runs along
-    the surface, as on a sliding sash, or into it, it comes against the surface's normal instead; where something
-    stands in the way, along the normal or the line of sight, which is free as far as the camera sees.
+) -> tuple[Contact, Contact]:
+    """Choose where to touch each cloud and from which side, see the module's description.
 
     Args:
         points: [B, N, 3] world points, m; the ground is z = 0.
@@ -106,60 +87,123 @@ def choose_contact(
         options: thresholds.
 
     Returns:
-        Contact point [B, 3], unit flow there [B, 3], unit direction [B, 3] in which the hand stands off it, and the
-        points that would do as well [B, CANDIDATES, CANDIDATE], for :func:`best_candidate`. All are 0 for a cloud
-        without flow; so are the candidates beyond the last one.
+        The contact, and CANDIDATES candidates: the points that would do as well, for :func:`best_candidate`. Both are 0
+        for a cloud without flow, and so are candidates beyond the last one.
     """
     norm = flow.norm(dim=-1).masked_fill(~valid, 0.0)
     largest = norm.amax(-1, keepdim=True)
-    cloud, seen = points, valid
-    obstacle = valid & ~(norm > 0.05 * largest if part is None else part)
-    moving = (valid & (norm > 0.05 * largest)).any(0).nonzero().flatten()  # only these columns can be chosen
-    if not len(moving):
-        nothing = torch.zeros_like(camera)
-        return nothing, nothing, nothing, nothing.new_zeros(len(nothing), CANDIDATES, CANDIDATE)
-    points, valid, flow, avoid, norm = (x[:, moving] for x in (points, valid, flow, avoid, norm))
-    body = None if part is None else part[:, moving] & valid
+    moves = norm > 0.05 * largest
+    columns = (valid & moves).any(0).nonzero().flatten()  # only these can be chosen
+    if not len(columns):
+        nothing = Contact.none(camera.shape[:1], camera)
+        return nothing.at(torch.zeros(len(camera), dtype=torch.int64, device=camera.device)), nothing
+    scene = _Scene(points, valid, valid & ~(moves if part is None else part), camera)
+    points, valid, flow, avoid, norm = (x[:, columns] for x in (points, valid, flow, avoid, norm))
+    body = None if part is None else part[:, columns] & valid
     on_part = valid & (norm > 0.05 * largest) & (largest > 0)
+    share = norm / largest.clamp_min(1e-9)
+    surface = _surface(points, flow, on_part, columns, scene, options)
     weak = on_part & (norm >= options.weak_flow * largest)
     movable = weak & (norm >= options.min_flow * largest)
-    squared = squared_distances(points, cloud)
-    among = squared[:, :, moving].masked_fill_(~on_part[:, None], torch.inf)
-    nearest = among.topk(min(options.neighbors, len(moving)), largest=False)  # as knn finds them
-    curvature, normals = pca_curvature(points, nearest, on_part, camera)
-    direction = normalize(flow)
-    along = (direction * normals).sum(-1, keepdim=True)
-    sight = normalize(camera[:, None] - points)
-    usual = torch.where(along >= options.facing, direction, normals)
-    if options.collisions:
-        usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
-        as_usual = ~_blocked(points, cloud, squared, seen, usual, options)
-    else:
-        as_usual = torch.ones_like(weak)
+    usual_free, free, standoff = _standoffs(points, surface, weak, scene, options)
 
-    # The first free way; the usual one where none is.
-    free, standoff = as_usual, usual
-    for way in (normals, sight):
-        todo = (weak & ~free).any(0).nonzero().flatten()
-        opened = torch.zeros_like(free)
-        opened[:, todo] = ~_blocked(points[:, todo], cloud, squared[:, todo], seen, way[:, todo], options)
-        opened &= ~free
-        free, standoff = free | opened, torch.where(opened[..., None], way, standoff)
-
-    smooth = (curvature <= options.curvature) & ~_rim(points, nearest, options)
     fresh = ~avoid
-    share = norm / largest.clamp_min(1e-9)
     worth = _worth(share, points, standoff, hand, axis, options)
     peak = torch.where(movable & fresh, worth, torch.full_like(norm, -torch.inf)).argmax(-1)
     rows = torch.arange(len(points), device=points.device)
     distance = (points - points[rows, peak][:, None]).norm(dim=-1)
-    reachable = weak & smooth & fresh & free
+    reachable = weak & surface.smooth & fresh & free
     clear = reachable
     if options.collisions:
-        clear = _clear(points, body, flow, cloud, obstacle, standoff, reachable, distance, options)
+        clear = _clear(points, body, flow, scene, standoff, reachable, distance, options)
+    good = _good(movable, surface.smooth, usual_free, free, fresh, reachable, clear)
 
+    far_enough = good & (distance >= options.min_distance)
+    near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
+    index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
+    found = movable.any(-1)[:, None]
+    every = Contact(points, surface.direction, standoff, share[..., None], batch_size=points.shape[:1])
+    chosen = every.at(index).apply(lambda x: torch.where(found, x, 0.0))
+    return chosen, _first(every, good & found)
+
+
+def best_candidate(candidates: Contact, hand: Tensor, axis: Tensor, options: ContactOptions) -> Contact:
+    """The candidate that is worth most to a hand that has moved on since they were chosen.
+
+    Args:
+        candidates: of :func:`choose_contact`.
+        hand: [B, 3] position of the suction tip, m.
+        axis: [B, 3] unit direction from the tip to the hand.
+        options: thresholds.
+    """
+    share = candidates.share.squeeze(-1)
+    worth = _worth(share, candidates.point, candidates.standoff, hand, axis, options)
+    return candidates.at(worth.masked_fill(share == 0, -torch.inf).argmax(-1))
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What surrounds the points that may be chosen: the cloud [B, N, 3], what is seen and in the way [B, N], camera."""
+
+    cloud: Tensor
+    seen: Tensor
+    obstacle: Tensor
+    camera: Tensor
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """The surface at M points: unit flow and normal [B, M, 3], whether flat and no rim [B, M], distances [B, M, N]."""
+
+    direction: Tensor
+    normals: Tensor
+    smooth: Tensor
+    squared: Tensor
+
+
+def _surface(
+    points: Tensor, flow: Tensor, on_part: Tensor, columns: Tensor, scene: _Scene, options: ContactOptions
+) -> _Surface:
+    """The surface around each point [B, M, 3], which are the cloud's ``columns``."""
+    squared = squared_distances(points, scene.cloud)
+    among = squared[:, :, columns].masked_fill_(~on_part[:, None], torch.inf)
+    nearest = among.topk(min(options.neighbors, len(columns)), largest=False)  # as knn finds them
+    curvature, normals = pca_curvature(points, nearest, on_part, scene.camera)
+    smooth = (curvature <= options.curvature) & ~_rim(points, nearest, options)
+    return _Surface(normalize(flow), normals, smooth, squared)
+
+
+def _standoffs(
+    points: Tensor, surface: _Surface, weak: Tensor, scene: _Scene, options: ContactOptions
+) -> tuple[Tensor, Tensor, Tensor]:
+    """From which side to come to each point: whether the usual way is free, whether any is [B, M], the way [B, M, 3].
+
+    The usual way is against the flow, or against the normal where the flow runs along the surface or into it. The
+    others are the normal and the line of sight, of which the first free one is taken; the usual one where none is.
+    """
+    sight = normalize(scene.camera[:, None] - points)
+    along = (surface.direction * surface.normals).sum(-1, keepdim=True)
+    usual = torch.where(along >= options.facing, surface.direction, surface.normals)
+    usual_free = torch.ones_like(weak)
+    if options.collisions:
+        usual = torch.where(_underground(points, usual, options)[..., None], sight, usual)
+        usual_free = ~_blocked(points, scene, surface.squared, usual, options)
+    free, standoff = usual_free, usual
+    for way in (surface.normals, sight):
+        todo = (weak & ~free).any(0).nonzero().flatten()
+        opened = torch.zeros_like(free)
+        opened[:, todo] = ~_blocked(points[:, todo], scene, surface.squared[:, todo], way[:, todo], options)
+        opened &= ~free
+        free, standoff = free | opened, torch.where(opened[..., None], way, standoff)
+    return usual_free, free, standoff
+
+
+def _good(
+    movable: Tensor, smooth: Tensor, usual_free: Tensor, free: Tensor, fresh: Tensor, reachable: Tensor, clear: Tensor
+) -> Tensor:
+    """The points that meet the strictest list of demands that any point of the cloud meets, [B, M] bool."""
     tiers = [
-        movable & smooth & as_usual & fresh & clear,
+        movable & smooth & usual_free & fresh & clear,
         movable & smooth & free & fresh & clear,
         reachable & clear,
         movable & smooth & free & fresh,
@@ -168,33 +212,21 @@ def choose_contact(
         movable & fresh,
         movable,
     ]
-    score = torch.stack([tier.any(-1) for tier in tiers], dim=-1).int().argmax(-1)  # the first tier with a point
-    good = torch.stack(tiers, dim=1).gather(1, score[:, None, None].expand(-1, 1, valid.shape[1])).squeeze(1)
-
-    far_enough = good & (distance >= options.min_distance)
-    near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
-    index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
-    found = movable.any(-1)[:, None]
-    candidate = torch.cat([points, direction, standoff, share[..., None]], dim=-1)
-    *chosen, _ = torch.where(found, candidate[rows, index], 0.0).split(LAYOUT, dim=-1)
-    first = good.int().argsort(dim=-1, descending=True, stable=True)[:, :CANDIDATES]  # clouds are in random order
-    kept = gather(torch.where((good & found)[..., None], candidate, 0.0), first)
-    return *chosen, torch.nn.functional.pad(kept, (0, 0, 0, CANDIDATES - kept.shape[1]))
+    first = torch.stack([tier.any(-1) for tier in tiers], dim=-1).int().argmax(-1)  # the first tier with a point
+    index = first[:, None, None].expand(-1, 1, movable.shape[1])
+    return torch.stack(tiers, dim=1).gather(1, index).squeeze(1)
 
 
-def best_candidate(candidates: Tensor, hand: Tensor, axis: Tensor, options: ContactOptions) -> Tensor:
-    """The candidate [B, CANDIDATE] that is worth most to a hand that has come elsewhere meanwhile.
+def _first(contacts: Contact, good: Tensor) -> Contact:
+    """The first CANDIDATES of the good contacts, then 0; a cloud's points are in random order."""
+    order = good.int().argsort(dim=-1, descending=True, stable=True)[:, :CANDIDATES]
+    missing = CANDIDATES - order.shape[1]
 
-    Args:
-        candidates: [B, CANDIDATES, CANDIDATE] of :func:`choose_contact`.
-        hand: [B, 3] position of the suction tip, m.
-        axis: [B, 3] unit direction from the tip to the hand.
-        options: thresholds.
-    """
-    points, _, standoff, share = candidates.split(LAYOUT, dim=-1)
-    worth = _worth(share.squeeze(-1), points, standoff, hand, axis, options)
-    best = worth.masked_fill(share.squeeze(-1) == 0, -torch.inf).argmax(-1)
-    return candidates[torch.arange(len(best), device=best.device), best]
+    def kept(values: Tensor) -> Tensor:
+        chosen = gather(torch.where(good[..., None], values, 0.0), order)
+        return torch.nn.functional.pad(chosen, (0, 0, 0, missing))
+
+    return contacts.apply(kept)
 
 
 def _worth(
@@ -215,19 +247,17 @@ def _rim(points: Tensor, nearest: tuple[Tensor, Tensor], options: ContactOptions
     return (mean - points).norm(dim=-1) > options.rim * spread
 
 
-def _blocked(
-    points: Tensor, cloud: Tensor, squared: Tensor, valid: Tensor, standoff: Tensor, options: ContactOptions
-) -> Tensor:
+def _blocked(points: Tensor, scene: _Scene, squared: Tensor, standoff: Tensor, options: ContactOptions) -> Tensor:
     """Whether the cloud, or the ground, is in the cylinder that the hand needs before each point, [B, M] bool.
 
     ``squared`` [B, M, N] are the squared distances from the M points to the N of the cloud.
     """
     middle, half = (options.reach + options.clearance) / 2, (options.reach - options.clearance) / 2
     # In place and with one comparison: memory for M times N numbers takes longer to come by than to fill.
-    ahead = (standoff @ cloud.mT).sub_((standoff * points).sum(-1, keepdim=True))  # [B, M, N]
+    ahead = (standoff @ scene.cloud.mT).sub_((standoff * points).sum(-1, keepdim=True))  # [B, M, N]
     outside = torch.addcmul(squared, ahead, ahead, value=-1).sub_(options.hand_radius**2)
     beyond = ahead.sub_(middle).abs_().sub_(half)
-    inside = (torch.maximum(outside, beyond, out=outside) < 0).logical_and_(valid[:, None])
+    inside = (torch.maximum(outside, beyond, out=outside) < 0).logical_and_(scene.seen[:, None])
     return (inside.sum(-1, dtype=torch.int32) > 1) | _underground(points, standoff, options)
 
 
@@ -240,8 +270,7 @@ def _clear(
     points: Tensor,
     part: Tensor | None,
     flow: Tensor,
-    cloud: Tensor,
-    obstacle: Tensor,
+    scene: _Scene,
     standoff: Tensor,
     wanted: Tensor,
     distance: Tensor,
@@ -249,8 +278,8 @@ def _clear(
 ) -> Tensor:
     """Which points the hand can hold all along their way with the part, [B, M] bool.
 
-    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet the cloud's
-    points of ``obstacle`` or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the
+    The way is that of the part's rigid motion; the hand, a few balls behind the point, must not meet the scene's
+    obstacles or the ground. At most ``candidates`` of the ``wanted`` points are looked at, from the
     smallest to the largest ``distance``; the others count as not clear.
     """
     count = min(options.candidates, points.shape[1])
@@ -271,7 +300,7 @@ def _clear(
     meets = torch.stack(
         [
             _within(balls, stuff[mask], options.hand_radius)
-            for balls, stuff, mask in zip(hand, cloud, obstacle, strict=True)
+            for balls, stuff, mask in zip(hand, scene.cloud, scene.obstacle, strict=True)
         ]
     )
     clear = (~meets & (hand[..., 2] > 0)).flatten(2).all(-1)

@@ -1,8 +1,8 @@
-"""Several learners as one policy, whose disagreement says how far it is from what it has learned."""
+"""Several learners as one policy, whose disagreement measures how far a state is from the training data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -10,9 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from fb3d_rl.contract import Key
+from fb3d_rl.policies.policy import Policy, initial_state
 
 
-class Ensemble(TensorDictModuleBase):
+class Ensemble(Policy):
     """The mean action of M learners and their variance.
 
     "action" and what all members declare below "learner", such as a predicted discrepancy, are the members' means.
@@ -20,7 +21,7 @@ class Ensemble(TensorDictModuleBase):
     as they are the whole ensemble), averaged over the entries: 1/(D M) sum_d sum_m (a_md - mean_d)^2. That is the
     novelty of ThriftyDAgger and, since actions are normalised, EnsembleDAgger's variance in one number.
 
-    Every member sees the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
+    Every member reads the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
     keep has to be one of the observation, such as the last actions: the first member writes it for all.
 
     Args:
@@ -45,8 +46,7 @@ class Ensemble(TensorDictModuleBase):
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
         """The state that the members share, at the start of an episode; empty if they have none."""
-        start: Callable[[torch.Size], TensorDict] | None = getattr(self.members[0], "initial_state", None)
-        return TensorDict({}, batch_size=batch) if start is None else start(batch)
+        return initial_state(self.members[0], batch)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the means, the variance and the next state."""

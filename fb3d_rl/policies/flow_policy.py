@@ -1,154 +1,58 @@
 """The flow policy: approach a point against its flow, touch, hold, then pull along the current flow.
 
 It does not know where its flow comes from. Fed the ground truth it is the expert; fed ArtFlowNet's prediction it is
-FlowBot3D. Its state travels in the TensorDict under "policy". Each environment is steered by itself, in numbers of its
-own; what looks at all points of a cloud is batched over the environments that need it.
+FlowBot3D. Its state travels in the TensorDict under "policy". In each step it first decides the phase by what it
+observes (:mod:`~fb3d_rl.policies.transitions`), then commands a tip velocity
+(:mod:`~fb3d_rl.policies.commands`); the hand turns towards ``standoff`` in every phase.
+
+======== ================================== ========================================= =================================
+phase    observed                           decided                                   commanded
+======== ================================== ========================================= =================================
+SELECT   cloud, flow, failed points         a contact point: TRAVEL                   no motion until there is one
+TRAVEL   tip, hand axis, force              on the approach line: APPROACH;           to the pre-contact point, around
+                                            halted by something unseen: RETREAT       the object if need be
+APPROACH tip, force, suction                held: PULL;                               along the approach line, slow from
+                                            pressed too long, or missed: RETREAT      the pre-contact point on
+PULL     cloud, flow, tip, suction          hold lost: RETREAT;                       along the flow at the tip; the
+                                            no progress: RELEASE                      hand turns as the flow does
+RETREAT  tip, force                         far enough away, or halted: SELECT        away from the contact point
+RELEASE  suction                            off: RETREAT;                             away across the flow, at full
+                                            still held after a while: PULL            speed
+======== ================================== ========================================= =================================
+
+In any phase but PULL and RELEASE a hand that suction holds goes on to PULL. After the last allowed retry RETREAT
+becomes SELECT without a choice: the hand stays. ::
+
+    SELECT -> TRAVEL -> APPROACH -> PULL -> RELEASE
+       ^         |          |        | ^       | |
+       |         v          v        v +-------+ |
+       +------ RETREAT <-------------+ <---------+
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import fields
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
-from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.errors import UserError
-from fb3d_rl.geometry.points import squared_distances
-from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion
-from fb3d_rl.geometry.vectors import Vector, alignment, cross, length, normalize, rotate
+from fb3d_rl.geometry.transforms import alignment
 from fb3d_rl.models.artflownet import artflownet_module, reads_mask
-from fb3d_rl.policies.contact import CANDIDATE, CANDIDATES, LAYOUT, ContactOptions, best_candidate, choose_contact
+from fb3d_rl.policies.commands import above_ground, command
+from fb3d_rl.policies.contact import Contact, best_candidate
+from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
-
-SELECT, TRAVEL, APPROACH, PULL, RETREAT, RELEASE = range(6)
-"""Phases. Grasp selection (supplement, I.F and I.G) is 0 to 2, 4 and 5, articulation execution (I.G) is 3."""
-
-PHASES = ("select", "travel", "approach", "pull", "retreat", "release")
-"""Their names."""
+from fb3d_rl.policies.options import FlowPolicyOptions
+from fb3d_rl.policies.policy import Policy
+from fb3d_rl.policies.transitions import advance
 
 MASK = ("observation", "part_mask")
 """Where the mask of the part to open is read."""
 
-TRIES = 6
-"""Contact points that are remembered as tried in vain."""
 
-
-@dataclass(frozen=True)
-class FlowPolicyOptions:
-    """Speeds, gains, distances and times of the flow policy.
-
-    Attributes:
-        travel_speed: of the tip around the object, m/s.
-        approach_speed: of the tip on the way to the pre-contact point, m/s.
-        touch_speed: of the tip from there on (guarded), m/s.
-        pull_speed: factor that turns the normalised flow into a tip velocity (I.G), m/s.
-        angular_gain: factor that turns the rotation q_diff into an angular velocity (I.G), 1/s.
-        precontact: distance (m) of the pre-contact point in front of the contact point (I.G).
-        line: how far (m) off the approach line the tip may be when it turns to the contact point.
-        overshoot: how far (m) the tip may pass the contact point before the approach has failed.
-        force: contact force (N) that ends an approach which does not hold.
-        patience: how long (s) that force is borne, since suction may still engage.
-        stuck_speed: a pull is stuck if the tip moves slower (m/s) along the flow than this ...
-        stuck_time: ... for longer (s) than this: the hand tears itself off and tries elsewhere.
-        release_time: how long (s) it tries to tear itself off before it pulls on.
-        fade: share of the way behind it that still counts a twentieth of a second later where it has to go back.
-        retries: how often it chooses another contact point after it has missed one or lost hold; then it stays where it
-            is. None: as often as there is time.
-        retry_distance: points nearer (m) than this to a point tried in vain are not tried.
-        nearby: distance (m) from the held point at which a point's flow counts half in the motion that is fitted there.
-        lead: how far ahead of the observation the flow is read along the part's motion, as a share of a control step:
-            half of it, so that the tip moves on the chord of its arc and does not drift outwards.
-        clearance: height (m) below which the hand's far end does not sink: a door that swings down would pin it
-            between itself and the ground z = 0.
-        funnel: how much (m) the tip stays farther out than the pre-contact point for each metre off the approach line.
-        free: distance (m) from the visible points at which a straight way to the approach line is free.
-        margin: distance (m) that the tip keeps from the object's bounding sphere where the straight way is not free.
-        mask: which points the policy is told to act on: "target", those of the part to open, or "none": whatever has a
-            flow (the paper's "without mask").
-        contact: how a contact point is chosen.
-    """
-
-    travel_speed: float = 1.8
-    approach_speed: float = 1.6
-    touch_speed: float = 0.3
-    pull_speed: float = 0.8
-    angular_gain: float = 8.0
-    precontact: float = 0.1
-    line: float = 0.06
-    overshoot: float = 0.08
-    force: float = 20.0
-    patience: float = 0.2
-    stuck_speed: float = 0.08
-    stuck_time: float = 0.3
-    release_time: float = 0.9
-    fade: float = 0.8
-    retries: int | None = None
-    retry_distance: float = 0.08
-    nearby: float = 0.1
-    lead: float = 0.5
-    clearance: float = 0.07
-    funnel: float = 0.5
-    free: float = 0.08
-    margin: float = 0.1
-    mask: Literal["target", "none"] = "target"
-    contact: ContactOptions = field(default_factory=ContactOptions)
-
-    def require_mask(self, what: str) -> None:
-        """Check that the policy is shown the part to open.
-
-        Raises:
-            UserError: it is not, and ``what`` cannot do without.
-        """
-        if self.mask != "target":
-            raise UserError(f"{what} has to see which part to open: leave policy.mask=target")
-
-
-@dataclass
-class Memory:
-    """What the policy remembers of one environment from step to step.
-
-    Attributes:
-        phase: one of the phases.
-        contact_point: where to touch, m.
-        standoff: unit direction in which the hand stands off the contact point.
-        pull: unit flow there.
-        idle: control steps in which nothing moved on.
-        leave: unit direction in which the hand backs off, or leaves the object's bounding sphere.
-        tip: the suction tip in the last step, m.
-        came: where the tip came from, m, faded.
-        tried: the last ``TRIES`` points that were tried in vain, m.
-        tries: how many that were.
-        chosen: how many contact points it has set out for.
-        candidates: points that would have done as well as the chosen one when it was chosen
-            (:func:`~fb3d_rl.policies.contact.choose_contact`).
-    """
-
-    phase: int
-    contact_point: Vector
-    standoff: Vector
-    pull: Vector
-    idle: int
-    leave: Vector
-    tip: Vector
-    came: Vector
-    tried: np.ndarray
-    tries: int
-    chosen: int
-    candidates: np.ndarray
-
-    def give_up(self, point: Vector) -> None:
-        """Remember a point that was tried in vain."""
-        self.tried[self.tries % TRIES] = point
-        self.tries += 1
-
-
-class FlowPolicy(TensorDictModuleBase):
+class FlowPolicy(Policy):
     """Turns a flow into gripper velocities.
 
     Args:
@@ -158,23 +62,8 @@ class FlowPolicy(TensorDictModuleBase):
         options: speeds, gains, distances and times.
 
     Shapes: reads the contract's "observation" group and the flow [E, N, 3]; writes ``action`` [E, 8] and the next
-    step's state under ``("next", "policy")``, whose layout :meth:`initial_state` gives.
+    step's state (:class:`~fb3d_rl.policies.flow_state.FlowState`) under ``("next", "policy")``.
     """
-
-    STATE: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        "phase": ((1,), torch.int64),
-        "contact_point": ((3,), torch.float32),
-        "standoff": ((3,), torch.float32),
-        "pull": ((3,), torch.float32),
-        "idle": ((1,), torch.int64),
-        "leave": ((3,), torch.float32),
-        "tip": ((3,), torch.float32),
-        "came": ((3,), torch.float32),
-        "tried": ((TRIES, 3), torch.float32),
-        "tries": ((1,), torch.int64),
-        "chosen": ((1,), torch.int64),
-        "candidates": ((CANDIDATES, CANDIDATE), torch.float32),
-    }
 
     def __init__(
         self, flow_key: tuple[str, str], limits: VelocityLimits, options: FlowPolicyOptions | None = None
@@ -183,339 +72,73 @@ class FlowPolicy(TensorDictModuleBase):
         self.flow_key = flow_key
         self.limits = limits
         self.options = options or FlowPolicyOptions()
-        o, self._period = self.options, limits.period
-        self._patience, self._stuck, self._release = (
-            round(time / self._period) for time in (o.patience, o.stuck_time, o.release_time)
-        )
-        self._still = o.stuck_speed * self._period
-        self._fade = o.fade ** (self._period / 0.05)
+        self._control = Control(self.options, limits)
+        state = [field.name for field in fields(FlowState)]
         observed = ("points", "valid", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
         self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
-        self.in_keys += [MASK] if o.mask == "target" else []
-        self.in_keys += [("policy", key) for key in self.STATE]
-        self.out_keys = ["action"] + [("next", "policy", key) for key in self.STATE]
+        self.in_keys += [MASK] if self.options.mask == "target" else []
+        self.in_keys += [("policy", key) for key in state]
+        self.out_keys = ["action"] + [("next", "policy", key) for key in state]
 
-    @classmethod
-    def initial_state(cls, batch: torch.Size | tuple[int, ...]) -> TensorDict:
-        """The state at the start of an episode: all zeros, phase SELECT."""
-        zeros = {key: torch.zeros(*batch, *shape, dtype=dtype) for key, (shape, dtype) in cls.STATE.items()}
-        return TensorDict(zeros, batch_size=batch)
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """The state {"policy": ...} at the start of an episode: all zeros, phase SELECT."""
+        return TensorDict({"policy": FlowState.initial(batch).packed()}, batch_size=batch)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action and the next policy state."""
-        obs, flow = tensordict["observation"], tensordict[self.flow_key]
-        tool_pose = obs["tool_pose"]
-        axis = hand_axis(tool_pose)
-        tips, hands = _numbers(tool_pose[:, :3]), _numbers(axis)
-        attached, force = obs["attached"].flatten().tolist(), obs["contact_force"].flatten().tolist()
-        senses = obs["goal_sense"].flatten().tolist()
-        memories = _recall(tensordict["policy"])
-        pulled = [memory.phase == PULL for memory in memories]
-
-        for i, memory in enumerate(memories):
-            self._advance(memory, tips[i], hands[i], attached[i], force[i] > self.options.force, senses[i])
-        self._choose(memories, obs, axis, flow)
-        pulls = self._flow_at(memories, obs, flow, senses)
-        clouds = self._clouds(memories, obs)
-
-        twists = np.empty((len(memories), 6))
-        for i, (memory, tip, hand) in enumerate(zip(memories, tips, hands, strict=True)):
-            if memory.phase == PULL:
-                if pulled[i]:
-                    # The hand keeps its angle to the flow: what turns the last flow into the flow now turns the hand.
-                    memory.standoff = rotate(memory.standoff, alignment(memory.pull, pulls[i]))
-                memory.pull = pulls[i]
-                velocity = senses[i] * self.options.pull_speed * memory.pull
-            elif memory.phase == TRAVEL:
-                velocity = self._travel(memory, tip, clouds[i])
-            else:
-                velocity = self._path_velocity(memory, tip)
-            wanted = self._above_ground(memory.standoff, tip)
-            twists[i, :3], twists[i, 3:] = velocity, self._gain(self.options.angular_gain) * alignment(hand, wanted)
-        twist = torch.from_numpy(twists).to(axis)
-        tensordict["action"] = joint_velocities(obs, axis, twist[:, :3], twist[:, 3:], self.limits)
-        tensordict["next", "policy"] = self._state(memories, tensordict.device)
+        obs = tensordict["observation"]
+        hand = hand_axis(obs["tool_pose"])
+        state = FlowState.read(tensordict["policy"])
+        seen = Observed(
+            phase=state.phase,
+            tip=obs["tool_pose"][:, :3].double(),
+            hand=hand.double(),
+            attached=obs["attached"],
+            force=obs["contact_force"].double(),
+            sense=obs["goal_sense"].double(),
+            points=obs["points"],
+            valid=obs["valid"],
+            part=None if self.options.mask == "none" else obs["part_mask"],
+            flow=tensordict[self.flow_key],
+            camera=obs["camera_position"],
+        )
+        state, velocity = command(advance(state, seen, self._control), seen, self._control)
+        axis = above_ground(state.standoff, seen.tip, self.options.clearance)
+        angular = self._control.gain(self.options.angular_gain) * alignment(seen.hand, axis)
+        tensordict["action"] = joint_velocities(obs, hand, velocity.to(hand), angular.to(hand), self.limits)
+        tensordict["next", "policy"] = state.packed()
         return tensordict
 
-    def _advance(self, memory: Memory, tip: Vector, hand: Vector, attached: bool, touches: bool, sense: float) -> None:
-        """Move on to the phase that the observation calls for."""
-        o, m = self.options, memory
-        moved, came = tip - m.tip, m.came
-        m.tip, m.came = tip, np.zeros(3)
-        offset = tip - m.contact_point
-        height = float(offset @ m.standoff)
-        halted = touches and length(moved) < self._still
+    def choose_again(self, tensordict: TensorDictBase, where: Tensor) -> None:
+        """Head for the candidate that is best by now, in environments that are on their way to a part at rest.
 
-        if m.phase == SELECT:
-            m.idle = 0
-        elif m.phase == TRAVEL:
-            m.idle = m.idle + 1 if halted else 0
-            m.came = self._fade * came - moved
-            if m.idle > self._stuck:  # something stands in the way that the cloud does not show
-                m.give_up(m.contact_point)
-                m.leave = normalize(m.came)
-                m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
-            elif (
-                length(alignment(hand, m.standoff)) < 0.15
-                and length(offset - height * m.standoff) < o.line
-                and height > 0
-            ):
-                m.phase = APPROACH
-        elif m.phase == APPROACH:
-            m.idle = m.idle + 1 if touches else 0
-            if not attached and (m.idle > self._patience or height < -o.overshoot):
-                m.give_up(m.contact_point)
-                m.phase, m.leave = RETREAT, m.standoff
-        elif m.phase == PULL:
-            m.idle = m.idle + 1 if attached and sense * (moved @ m.pull) < self._still else 0
-            if not attached:
-                # It backs off from where it is, not from a contact point that is far away.
-                m.phase, m.leave, m.contact_point, m.standoff = RETREAT, m.standoff, tip, hand
-            elif m.idle > self._stuck and self._tries_on(m):
-                m.give_up(tip)
-                m.phase, m.leave, m.idle = RELEASE, _across(hand, m.pull), 0
-        elif m.phase == RETREAT:
-            m.idle = m.idle + 1 if halted else 0
-            if offset @ m.leave > o.precontact or m.idle > self._stuck:
-                m.phase = SELECT
-        elif m.phase == RELEASE:
-            m.idle += 1
-            if not attached:
-                m.phase, m.contact_point, m.standoff = RETREAT, tip, hand
-            if m.idle > self._release:  # it does not come off: pull on
-                m.phase, m.idle = PULL, 0
-
-        if m.phase == RETREAT and not self._tries_on(m):
-            m.phase, m.standoff = SELECT, hand  # and there it stays
-        if attached and m.phase not in (PULL, RELEASE):
-            if m.phase != APPROACH:  # held by chance, from another side than chosen
-                m.standoff = hand
-            m.phase = PULL
-
-    def _tries_on(self, memory: Memory) -> bool:
-        """Whether it may choose a contact point (again)."""
-        return self.options.retries is None or memory.chosen <= self.options.retries
-
-    def choose_again(self, state: TensorDictBase, obs: TensorDictBase, where: Tensor) -> None:
-        """Send the hand, on its way to a part that nothing has moved, to what is the best candidate from where it is.
-
-        The candidates are those of the first look, when the hand hid none of them: which points are seen over its
-        shoulder changes from step to step.
+        The candidates are those of the first observation, when the hand hid none of them: which points are seen past
+        the hand changes from step to step.
 
         Args:
-            state: as of :meth:`initial_state`; written in place.
-            obs: the contract's "observation" group.
+            tensordict: the step, whose ("policy", ...) state is replaced.
             where: [E, 1] bool, the environments to do so in.
         """
-        pose = obs["tool_pose"]
-        best = best_candidate(state["candidates"], pose[..., :3], hand_axis(pose), self.options.contact)
-        for key, value in zip(("contact_point", "pull", "standoff"), best.split(LAYOUT, dim=-1), strict=False):
-            state[key] = torch.where(where, value, state[key])
-        state["phase"] = torch.where(where, TRAVEL, state["phase"])
-        state["leave"] = torch.where(where, 0.0, state["leave"])
+        pose, state = tensordict["observation", "tool_pose"], FlowState.from_tensordict(tensordict["policy"])
+        candidates = Contact.from_tensordict(state.candidates)
+        best = best_candidate(candidates, pose[..., :3], hand_axis(pose), self.options.contact)
+        goal = {"contact_point": best.point, "pull": best.flow, "standoff": best.standoff}
+        tensordict["policy"] = state.changed(where, **goal, phase=TRAVEL, leave=0.0).packed()
 
     @staticmethod
-    def send(state: TensorDictBase, obs: TensorDictBase, chosen: tuple[Tensor, Tensor, Tensor, Tensor]) -> None:
-        """Send the hand, which holds nothing, to a contact point that somebody else has chosen.
+    def go_to(tensordict: TensorDictBase, chosen: Contact, candidates: Contact) -> None:
+        """Head for a contact point that somebody else has chosen, with a hand that holds nothing.
 
         Args:
-            state: as of :meth:`initial_state`; written in place.
-            obs: the contract's "observation" group.
-            chosen: as :func:`~fb3d_rl.policies.contact.choose_contact` returns it.
+            tensordict: the step, whose ("policy", ...) state is replaced.
+            chosen: the contact, as :func:`~fb3d_rl.policies.contact.choose_contact` returns it ...
+            candidates: ... with its candidates.
         """
-        contact, pull, standoff, candidates = chosen
-        state.update({"contact_point": contact, "pull": pull, "standoff": standoff, "candidates": candidates})
-        state["phase"] = torch.full_like(state["phase"], TRAVEL)
-        state["chosen"] = torch.ones_like(state["chosen"])
-        state["idle"] = torch.zeros_like(state["idle"])
-        state["leave"] = torch.zeros_like(state["leave"])
-        state["tip"] = obs["tool_pose"][..., :3].clone()  # nothing was remembered of where it came from
-        state["came"] = torch.zeros_like(state["came"])
-
-    def _choose(self, memories: list[Memory], obs: TensorDictBase, axis: Tensor, flow: Tensor) -> None:
-        """Choose a contact point in the environments that are about to, and send them there."""
-        rows = [i for i in _in_phase(memories, SELECT) if self._tries_on(memories[i])]
-        if not rows:
-            return
-        tip = obs["tool_pose"][..., :3]
-        points, valid, camera, hand, axis, flow = (
-            _rows(x, rows) for x in (obs["points"], obs["valid"], obs["camera_position"], tip, axis, flow)
-        )
-        part = self._part(obs, rows)
-        flow = torch.where((valid if part is None else part & valid)[..., None], flow, 0.0)
-        avoid = torch.zeros_like(valid)
-        for k, i in enumerate(rows):
-            for tried in torch.from_numpy(memories[i].tried[: memories[i].tries]).to(points):
-                avoid[k] |= (points[k] - tried).norm(dim=-1) < self.options.retry_distance
-        chosen = choose_contact(points, valid, part, flow, camera, hand, axis, avoid, self.options.contact)
-        for i, *found in zip(rows, *map(_numbers, chosen), strict=True):
-            memory = memories[i]
-            memory.contact_point, memory.pull, memory.standoff, memory.candidates = found
-            if memory.pull.any():
-                memory.phase, memory.chosen = TRAVEL, memory.chosen + 1
-
-    def _part(self, obs: TensorDictBase, rows: list[int]) -> Tensor | None:
-        """The mask of the part to open [K, N], if the policy is shown it."""
-        return None if self.options.mask == "none" else _rows(obs["part_mask"], rows)
-
-    def _path_velocity(self, memory: Memory, tip: Vector) -> Vector:
-        """Tip velocity (m/s) of the phases APPROACH, RETREAT and RELEASE; 0 while no contact point can be chosen."""
-        o = self.options
-        if memory.phase == APPROACH:
-            offset = tip - memory.contact_point
-            height = float(offset @ memory.standoff)
-            sideways = offset - height * memory.standoff
-            speed = min(max(self._gain(10.0) * (height - o.precontact), o.touch_speed), o.approach_speed)
-            return -speed * memory.standoff - self._gain(8.0) * sideways
-        if memory.phase == RETREAT:
-            return o.approach_speed * memory.leave
-        if memory.phase == RELEASE:
-            return self.limits.linear * memory.leave
-        return np.zeros(3)
-
-    def _clouds(self, memories: list[Memory], obs: TensorDictBase) -> dict[int, np.ndarray]:
-        """The visible points [M, 3] of each environment on its way, m."""
-        rows = _in_phase(memories, TRAVEL)
-        return {i: _numbers(obs["points"][i][obs["valid"][i]]) for i in rows}
-
-    def _gain(self, wanted: float) -> float:
-        """The gain (1/s) with which an offset is made up for: at most all of it in one control step."""
-        return min(wanted, 1.0 / self._period)
-
-    def _travel(self, memory: Memory, tip: Vector, cloud: np.ndarray) -> Vector:
-        """Velocity to the approach line: straight into a funnel that narrows to the pre-contact point, if that is free.
-
-        Otherwise around the object's bounding sphere to where the approach line leaves it. A hand that comes from
-        another side of the object leaves the sphere first as it backed off before.
-        """
-        o, contact, standoff = self.options, memory.contact_point, memory.standoff
-        highest = math.inf  # of a goal on the approach line that stays above the ground
-        if standoff[2] < 0:
-            highest = max((contact[2] - o.clearance) / -standoff[2], 2 * o.precontact)
-        if not memory.leave.any():
-            offset = tip - contact
-            sideways = length(offset - (offset @ standoff) * standoff)
-            goal = contact + min(o.precontact + o.funnel * sideways, highest) * standoff
-            if not self._in_the_way(cloud, tip, goal):
-                return self._straight(tip, goal)
-
-        centre, radius = np.zeros(3), o.margin
-        if len(cloud):
-            centre = 0.5 * (cloud.min(0) + cloud.max(0))
-            radius += float(np.linalg.norm(cloud - centre, axis=-1).max())
-        # |contact + t standoff - centre| = radius, the larger root
-        from_centre = contact - centre
-        b = float(from_centre @ standoff)
-        c = float(from_centre @ from_centre) - radius**2
-        t = -b + math.sqrt(max(b * b - c, 0.0))
-        goal = contact + min(max(t, 2 * o.precontact), highest) * standoff
-
-        distance = length(tip - centre)
-        if distance > radius or memory.leave @ standoff >= 0.5:
-            memory.leave = np.zeros(3)
-        if memory.leave.any():
-            return o.travel_speed * memory.leave
-        outward = normalize(tip - centre)
-        turn = alignment(outward, goal - centre)
-        if length(turn) > 0.35 and distance > 0.5 * radius:
-            tangent = cross(normalize(turn), outward)
-            around = tangent + min(max(radius - distance, -1.0), 1.0) * 4.0 * outward
-            return o.travel_speed * normalize(around)
-        return self._straight(tip, goal)
-
-    def _straight(self, tip: Vector, goal: Vector) -> Vector:
-        """Velocity to a goal, slower the last bit of the way."""
-        way = goal - tip
-        return min(self._gain(6.0) * length(way), self.options.travel_speed) * normalize(way)
-
-    def _in_the_way(self, cloud: np.ndarray, tip: Vector, goal: Vector) -> bool:
-        """Whether the straight way brings the tip near to points of the cloud that it is not as near to already."""
-        way, offset = goal - tip, cloud - tip
-        share = np.clip(offset @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
-        nearest = np.linalg.norm(offset - share[:, None] * way, axis=-1)
-        near = (nearest < self.options.free) & (nearest < np.linalg.norm(offset, axis=-1) - 0.01)
-        return int(near.sum()) > 1
-
-    def _flow_at(
-        self, memories: list[Memory], obs: TensorDictBase, flow: Tensor, senses: list[float]
-    ) -> dict[int, Vector]:
-        """Unit flow at the held point of each environment that pulls, ``lead`` ahead; the last one where none is seen.
-
-        The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the
-        near ones foremost: the hand often hides those around the held point. Without a mask what has a flow may belong
-        to several parts, so that only what is near counts.
-        """
-        rows = _in_phase(memories, PULL)
-        if not rows:
-            return {}
-        o = self.options
-        points, valid, tool_pose, flow = (_rows(x, rows) for x in (obs["points"], obs["valid"], obs["tool_pose"], flow))
-        part = self._part(obs, rows)
-        tip = tool_pose[:, :3]
-        squared = squared_distances(points, tip[:, None]).squeeze(-1)
-        if part is None:
-            weight = local_weight(flow, squared).masked_fill(~valid, 0.0)
-        else:
-            weight = (part & valid) / (1.0 + squared / o.nearby**2)
-        motion = rigid_motion(points, flow, weight, tip, 1e-2 * o.nearby**2)
-        found = {}
-        for i, at_tip, omega in zip(rows, *map(_numbers, motion), strict=True):
-            speed = length(at_tip)
-            unit = normalize(at_tip)
-            rate = senses[i] * o.lead * self._period * o.pull_speed / max(speed, 1e-6) * omega
-            found[i] = normalize(unit + cross(rate, unit)) if speed > 1e-6 else memories[i].pull
-        return found
-
-    def _above_ground(self, axis: Vector, tip: Vector) -> Vector:
-        """Lift a unit hand axis that would take the hand's far end below ``clearance``."""
-        lowest = min(max((self.options.clearance - tip[2]) / HAND_LENGTH, -1.0), 0.9)
-        if axis[2] >= lowest:
-            return axis
-        return np.append(normalize(axis[:2]) * math.sqrt(1.0 - lowest**2), lowest)
-
-    def _state(self, memories: list[Memory], device: torch.device | None) -> TensorDict:
-        """The TensorDict of :meth:`initial_state` that holds the memories."""
-        batch = (len(memories),)
-        state = {}
-        for key, (shape, dtype) in self.STATE.items():
-            values = np.array([getattr(memory, key) for memory in memories])
-            state[key] = torch.from_numpy(values).to(device, dtype).view(*batch, *shape)
-        # As in TorchRL's own libraries, without the checks of each entry at each step.
-        return TensorDict._new_unsafe(source=state, batch_size=torch.Size(batch), device=device)
-
-
-def _numbers(values: Tensor) -> np.ndarray:
-    """A tensor as a float64 array of its own."""
-    return values.cpu().numpy().astype(np.float64)
-
-
-def _rows(values: Tensor, rows: list[int]) -> Tensor:
-    """Those rows [K, ...] of [E, ...]."""
-    return values if len(rows) == len(values) else values[rows]
-
-
-def _recall(state: TensorDictBase) -> list[Memory]:
-    """The memories [E] that a state holds."""
-    columns = {
-        key: state[key].flatten().tolist() if shape == (1,) else _numbers(state[key])
-        for key, (shape, _) in FlowPolicy.STATE.items()
-    }
-    return [Memory(**dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
-
-
-def _in_phase(memories: list[Memory], phase: int) -> list[int]:
-    """Which environments are in ``phase``."""
-    return [i for i, memory in enumerate(memories) if memory.phase == phase]
-
-
-def _across(hand: Vector, pull: Vector) -> Vector:
-    """Unit direction across ``pull`` in which the hand backs off; a level one where it comes along ``pull``.
-
-    Across the flow the part cannot follow, so that the suction breaks; along it the part would only be moved on.
-    """
-    away = hand - (hand @ pull) * pull
-    return normalize(away if length(away) > 0.3 else cross(pull, np.array([0.0, 0.0, 1.0])))
+        state = FlowState.read(tensordict["policy"])
+        fresh = {key: torch.zeros_like(getattr(state, key)) for key in ("chosen", "idle", "leave", "came")}
+        state = state.updated(**fresh, tip=tensordict["observation", "tool_pose"][..., :3].double())
+        tensordict["policy"] = state.set_out(chosen, candidates).packed()
 
 
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:

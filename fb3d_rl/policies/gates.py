@@ -1,7 +1,7 @@
 """The gates of interactive imitation: when the expert takes over from the learner and hands back.
 
 Distances between actions are ||a_learner - a_expert|| over the D entries of normalised actions (the papers partly write
-its square). Wherever a gate compares a number of the learner's that is not finite, the expert acts.
+its square). Where a number of the learner that a gate compares is not finite, the expert acts.
 """
 
 from __future__ import annotations
@@ -244,9 +244,6 @@ GATES: dict[str, type[Gate]] = {
     "human": HumanGate,
 }
 """The gates by name."""
-
-BUDGETED = ("safe", "lazy", "thrifty")
-"""Those whose thresholds a budget sets."""
 
 
 def make_gate(name: str, **options: Any) -> Gate:

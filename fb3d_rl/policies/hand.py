@@ -1,4 +1,4 @@
-"""The hand's kinematics: tip velocity and turning of the hand in the world, to and from normalised joint velocities."""
+"""The hand's kinematics: linear and angular velocity in the world, to and from normalised joint velocities."""
 
 from __future__ import annotations
 
@@ -65,9 +65,9 @@ def joint_velocities(
 
 
 def hand_velocities(obs: TensorDictBase, hand: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
-    """Tip velocity [..., 3] (m/s) and turning of the hand axis [..., 3] (rad/s) of joint velocities.
+    """Tip velocity [..., 3] (m/s) and angular velocity of the hand axis [..., 3] (rad/s) of joint velocities.
 
-    The other way round of :func:`joint_velocities`, up to its damping and the spin about the hand's axis, which is 0.
+    The inverse of :func:`joint_velocities`, up to its damping and the spin about the hand's axis, which is 0.
 
     Args:
         obs: the contract's "observation" group, of which qpos and tool_pose are read.

@@ -12,7 +12,9 @@ from torch import Tensor, nn
 
 from fb3d_rl.contract import Key
 from fb3d_rl.errors import UserError
-from fb3d_rl.policies.flow_policy import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowPolicy
+from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.flow_state import APPROACH, RELEASE, RETREAT, SELECT, TRAVEL, FlowState
+from fb3d_rl.policies.policy import Policy, initial_state
 
 
 class Gate(nn.Module):
@@ -31,9 +33,9 @@ class Gate(nn.Module):
         """Set the thresholds, if a budget sets them, by what the last round showed.
 
         Args:
-            frames: the steps [T] in which the gate had a say, with what it reads, its state and the two actions. What
+            frames: the steps [T] in which the gate decided, with what it reads, its state and the two actions. What
                 is below "learner" is best that of the learner as it is now.
-            budget: in which share of the steps that the learner would make the expert may take over, 0 to 1.
+            budget: share of the learner's steps in which the expert may take over, 0 to 1.
         """
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
@@ -144,10 +146,10 @@ class HumanGate(Gate):
         return self._takes_over(tensordict)
 
 
-class InteractivePolicy(TensorDictModuleBase):
+class InteractivePolicy(Policy):
     """Expert and learner in one: ("expert", "action") is always the expert's label, "action" that of whoever acts.
 
-    The expert goes along in its own state while the learner acts, see :meth:`look_on`.
+    The expert keeps its own state while the learner acts, see :meth:`follow`.
 
     Args:
         expert: the flow policy with the true flow.
@@ -174,17 +176,17 @@ class InteractivePolicy(TensorDictModuleBase):
         self.out_keys = ["action", ("expert", "action"), ("expert", "acts"), ("next", "expert", "looks_on")]
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
-        """What travels in the TensorDict besides the flow policy's state; all of it is 0 at the start."""
-        looks_on = torch.zeros(*batch, 1, dtype=torch.bool)
-        state = TensorDict({"expert": {"looks_on": looks_on}}, batch_size=batch)
-        if self.learner is not None and hasattr(self.learner, "initial_state"):
-            state.update(self.learner.initial_state(batch))
+        """The states of expert, learner and gate, and whether the learner acted in the last step."""
+        state = TensorDict({"expert": {"looks_on": torch.zeros(*batch, 1, dtype=torch.bool)}}, batch_size=batch)
+        state.update(self.expert.initial_state(batch))
+        if self.learner is not None:
+            state.update(initial_state(self.learner, batch))
         return state.update(self.gate.initial_state(batch))
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write "action", ("expert", "action") and who acted."""
-        self.look_on(tensordict)
+        self.follow(tensordict)
         self.expert(tensordict)
         tensordict["expert", "action"] = tensordict["action"]
         if self.learner is None:
@@ -198,25 +200,23 @@ class InteractivePolicy(TensorDictModuleBase):
         tensordict["next", "expert", "looks_on"] = ~acts
         return tensordict
 
-    def look_on(self, tensordict: TensorDictBase) -> None:
-        """Keep the expert from drawing conclusions from steps that the learner made, and from insisting on its plan.
+    def follow(self, tensordict: TensorDictBase) -> None:
+        """Adapt the expert's state, in environments where the learner made the last step, to where the hand is by now.
 
         A learner cannot see which contact point the expert chose long ago, from elsewhere, nor whether it had begun its
         approach. So a label depends on what can be seen: until it holds the part, the expert chooses the point and
-        whether to approach it again at every step, for the hand as it is by now.
+        whether to approach it again at every step. Steps of the learner are no lack of progress of the expert, and what
+        the learner misses or loses is none of the expert's own tries.
         """
-        looks_on, state, obs = tensordict["expert", "looks_on"], tensordict["policy"], tensordict["observation"]
-        if not bool(looks_on.any()):
+        learner = tensordict["expert", "looks_on"]
+        if not bool(learner.any()):
             return
-        phase = state["phase"]
-        state["idle"] = torch.where(looks_on, 0, state["idle"])
-        away = looks_on & ((phase == RETREAT) | (phase == RELEASE))
-        if bool(away.any()):
-            state["phase"] = torch.where(away, SELECT, phase)
-            state["leave"] = torch.where(away, 0.0, state["leave"])
-        # What the learner misses or loses is none of the expert's own tries.
-        missed = looks_on & (state["phase"] == SELECT)
-        state["chosen"] = torch.where(missed, (state["chosen"] - 1).clamp_min(0), state["chosen"])
-        on_the_way = looks_on & ((phase == TRAVEL) | (phase == APPROACH))
-        if bool(on_the_way.any()):
-            self.expert.choose_again(state, obs, on_the_way)
+        state = FlowState.from_tensordict(tensordict["policy"])
+        phase = state.phase
+        backs_off = learner & ((phase == RETREAT) | (phase == RELEASE))
+        state = state.changed(learner, idle=0).changed(backs_off, phase=SELECT, leave=0.0)
+        missed = learner & (state.phase == SELECT)
+        tensordict["policy"] = state.changed(missed, chosen=(state.chosen - 1).clamp_min(0)).packed()
+        on_its_way = learner & ((phase == TRAVEL) | (phase == APPROACH))
+        if bool(on_its_way.any()):
+            self.expert.choose_again(tensordict, on_its_way)

@@ -1,9 +1,8 @@
-"""What imitation trains: from a cloud and what the hand feels straight to velocities."""
+"""What imitation trains: from a cloud and the state of the hand straight to velocities."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -18,27 +17,28 @@ from torch import Tensor, nn
 from torchrl.modules import IndependentNormal
 
 from fb3d_rl.contract import Key
-from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
+from fb3d_rl.policies.options import LearnerOptions
+from fb3d_rl.policies.policy import Policy
 
 TWIST = 6
-"""Tip velocity and turning of the hand in the world, each as a share of the gripper's limit."""
+"""Tip velocity and angular velocity of the hand in the world, each as a share of the gripper's limit."""
 
-FELT = 4 * 3 + 3
-"""What goes with a cloud: the hand's axis, its tip's velocity, the direction to the camera and the hand's turning, all
-in the world; held, force, height of the tip."""
+HAND_FEATURES = 4 * 3 + 3
+"""Numbers that describe the hand: its axis, its tip's velocity, the direction to the camera and its angular velocity,
+all in the world; held, force, height of the tip. They lie under the key "felt"."""
 
 INPUTS = ("points", "features", "valid", "felt")
-"""Entries of what the network sees."""
+"""Entries of the network's input."""
 
-FULL_FORCE = 50.0
-"""Contact force (N) beyond which the learner feels no difference."""
+LARGEST_FORCE = 50.0
+"""Contact force (N) at which the network's input saturates."""
 
-SEEN: tuple[Key, ...] = tuple(
+OBSERVED: tuple[Key, ...] = tuple(
     ("observation", key)
     for key in (
         "points",
@@ -52,7 +52,7 @@ SEEN: tuple[Key, ...] = tuple(
         "camera_position",
     )
 )
-"""What every learner reads."""
+"""What every learner reads of the observation."""
 
 FLOW_KEYS: dict[str, Key | None] = {
     "none": None,
@@ -62,56 +62,14 @@ FLOW_KEYS: dict[str, Key | None] = {
 """Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
 
 
-@dataclass(frozen=True)
-class LearnerOptions:
-    """The learner's network.
-
-    Attributes:
-        encoder: "attention", "pointnet" or "pointnet2", see :mod:`fb3d_rl.models.encoders`.
-        head: "deterministic", or "gaussian": a mean and a standard deviation; the mean is executed.
-        flow: the flow as a further input of each point: "none", "ground_truth", or "artflownet" for its prediction.
-        points: the first so many points of a cloud are looked at; they come in random order.
-        width: of the network's layers.
-        history: control steps before the present one whose feelings it remembers.
-        chunk: control steps that it plans ahead ...
-        execute: ... of which this many are executed before it looks again.
-        discrepancy: whether it also predicts its distance from the expert, which some gates ask for.
-    """
-
-    encoder: Literal["attention", "pointnet", "pointnet2"] = "attention"
-    head: Literal["deterministic", "gaussian"] = "deterministic"
-    flow: Literal["none", "ground_truth", "artflownet"] = "none"
-    points: int = 256
-    width: int = 64
-    history: int = 3
-    chunk: int = 1
-    execute: int = 1
-    discrepancy: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            UserError: a value is unknown or out of range.
-        """
-        for name, choices in (("encoder", ENCODERS), ("head", ("deterministic", "gaussian")), ("flow", FLOW_KEYS)):
-            if getattr(self, name) not in choices:
-                raise UserError(f"{name}={getattr(self, name)} is unknown; choose from {', '.join(choices)}")
-        for name, least in (("points", 16), ("width", 4), ("history", 0), ("chunk", 1), ("execute", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name}={getattr(self, name)} is too small; give {least} or more")
-        if self.execute > self.chunk:
-            raise UserError(f"execute={self.execute} is more than the chunk={self.chunk} that is planned")
-
-
 class TwistNetwork(nn.Module):
     """An encoder and its heads.
 
     Args:
         options: the network.
 
-    Shapes: :meth:`Learner.look`'s entries -> twist [B, chunk, 6], or of the Gaussian head mean and standard deviation;
-    then, if asked for, the discrepancy [B, 1].
+    Shapes: the entries of :meth:`Learner.network_inputs` -> twist [B, chunk, 6], or of the Gaussian head mean and
+    standard deviation; then, if asked for, the discrepancy [B, 1].
     """
 
     def __init__(self, options: LearnerOptions) -> None:
@@ -120,7 +78,7 @@ class TwistNetwork(nn.Module):
         planned = TWIST * options.chunk
         outputs = planned * (2 if options.head == "gaussian" else 1) + int(options.discrepancy)
         inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
-        self.encoder = ENCODERS[options.encoder](inputs, FELT * (1 + options.history), outputs, options.width)
+        self.encoder = ENCODERS[options.encoder](inputs, HAND_FEATURES * (1 + options.history), outputs, options.width)
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> Any:
         """See the class; a single output comes by itself."""
@@ -135,13 +93,13 @@ class TwistNetwork(nn.Module):
         return tuple(parts) if len(parts) > 1 else parts[0]
 
 
-class Learner(TensorDictModuleBase):
+class Learner(Policy):
     """A policy that imitates: cloud, hand and part mask -> velocities.
 
-    It sees the cloud from the suction tip, in the world's axes, and says how the tip shall move and the hand turn
-    there. So it does the same wherever the scene stands, and what it does turns and is mirrored with the scene, which
-    training makes use of. The known kinematics of the hand turn that into the contract's action; the fingers stay
-    closed, as in the supplement (II.C).
+    The network's frame has its origin at the suction tip and the world's axes; its output is the velocity of the tip
+    and the angular velocity of the hand. So it does not depend on where the scene stands, and the output turns and is
+    mirrored with the scene, which training uses as augmentation. The known kinematics of the hand convert the output
+    to the contract's action; the fingers stay closed, as in the supplement (II.C).
 
     Args:
         options: the network.
@@ -150,7 +108,7 @@ class Learner(TensorDictModuleBase):
         flow_net: an ArtFlowNet to predict the flow with, for the option flow="artflownet"; it is not trained.
 
     Shapes: reads the contract's observation [E, ...]; writes "action" [E, 8] and, if asked for, ("learner",
-    "discrepancy") [E, 1]. Its memory and its plan travel below "learner", see :meth:`initial_state`.
+    "discrepancy") [E, 1]. Its history and its plan travel below "learner", see :meth:`initial_state`.
     """
 
     def __init__(
@@ -172,7 +130,7 @@ class Learner(TensorDictModuleBase):
         self.flow_network = None if flow_net is None else flow_net.requires_grad_(False).eval()
         self._predict = None if flow_net is None else artflownet_module(flow_net)
         given = [flow] if flow and flow_net is None else []
-        self.in_keys = [*SEEN, *given, *(("learner", key) for key in self._state())]
+        self.in_keys = [*OBSERVED, *given, *(("learner", key) for key in self._state())]
         self.out_keys = ["action", *(("next", "learner", key) for key in self._state())]
         if options.discrepancy:
             self.out_keys.append(("learner", "discrepancy"))
@@ -182,25 +140,25 @@ class Learner(TensorDictModuleBase):
     def _state(self) -> dict[str, tuple[tuple[int, ...], torch.dtype]]:
         state: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
         if self.options.history:
-            state["felt"] = ((self.options.history, FELT), torch.float32)
+            state["felt"] = ((self.options.history, HAND_FEATURES), torch.float32)
         if self.options.execute > 1:
             state["plan"] = ((self.options.execute - 1, TWIST), torch.float32)
             state["planned"] = ((1,), torch.int64)
         return state
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
-        """What it remembers and plans {"learner": ...}, all 0 at the start of an episode."""
+        """History and plan {"learner": ...}, all zeros at the start of an episode."""
         state = {key: torch.zeros(*batch, *shape, dtype=dtype) for key, (shape, dtype) in self._state().items()}
         return TensorDict({"learner": state} if state else {}, batch_size=batch)
 
-    def look(self, rows: TensorDictBase) -> TensorDict:
-        """The network's inputs [B] of rows [B]: "points", "features", "valid" and "felt" [B, 1 + history, FELT]."""
+    def network_inputs(self, rows: TensorDictBase) -> TensorDict:
+        """Inputs [B] of rows [B]: "points", "features", "valid" and "felt" [B, 1 + history, HAND_FEATURES]."""
         obs, count = rows["observation"], self.options.points
         tip = obs["tool_pose"][..., :3]
         features = [obs["part_mask"][:, :count, None].to(tip.dtype)]
         if self.flow_key is not None:
             features.append(rows[self.flow_key][:, :count])
-        felt = feel(obs, self.limits)[:, None]
+        felt = hand_features(obs, self.limits)[:, None]
         if self.options.history:
             felt = torch.cat([felt, rows["learner", "felt"]], dim=1)
         return TensorDict(
@@ -221,7 +179,7 @@ class Learner(TensorDictModuleBase):
         return self
 
     def actor(self) -> TensorDictModuleBase:
-        """What TorchRL's BCLoss trains: :meth:`look`'s entries -> "twist" [B, chunk, 6] (and "discrepancy" [B, 1])."""
+        """What TorchRL's BCLoss trains: network inputs -> "twist" [B, chunk, 6] (and "discrepancy" [B, 1])."""
         outputs: list[Key] = ["loc", "scale"] if self.options.head == "gaussian" else ["twist"]
         if self.options.discrepancy:
             outputs.append("discrepancy")
@@ -238,10 +196,10 @@ class Learner(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, and what it remembers and plans."""
+        """Write the action, the history and the plan."""
         if self._predict is not None:
             self._predict(tensordict)
-        inputs, obs = self.look(tensordict), tensordict["observation"]
+        inputs, obs = self.network_inputs(tensordict), tensordict["observation"]
         outputs = self.network(*(inputs[key] for key in INPUTS))
         plan_now = outputs[0] if isinstance(outputs, tuple) else outputs
         twist, execute = plan_now[:, 0], self.options.execute
@@ -269,20 +227,20 @@ class _ChunkNormal(IndependentNormal):
         super().__init__(loc, scale, event_dim=2)
 
 
-def feel(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:
-    """What the hand feels [..., FELT], of the contract's "observation" group."""
+def hand_features(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:
+    """The features of the hand [..., HAND_FEATURES], of the contract's "observation" group."""
     hand = hand_axis(obs["tool_pose"])
     velocity, angular = hand_velocities(obs, hand, obs["qvel"])
-    force = (obs["contact_force"] / FULL_FORCE).clamp(max=1.0)
+    force = (obs["contact_force"] / LARGEST_FORCE).clamp(max=1.0)
     tip, held = obs["tool_pose"][..., :3], obs["attached"].to(force.dtype)
     camera = normalize(obs["camera_position"] - tip)
     own = [hand, velocity / limits.linear, camera, angular / limits.angular, held, force, tip[..., 2:]]
     return torch.cat(own, dim=-1)
 
 
-def history_of(felt: Tensor, count: int) -> Tensor:
-    """What a learner remembers at each step of an episode [T, count, FELT], the last step first, of felt [T, FELT]."""
-    padded = torch.cat([felt.new_zeros(count, felt.shape[-1]), felt])
+def history_of(features: Tensor, count: int) -> Tensor:
+    """The history at each step of an episode [T, count, HAND_FEATURES], the last step first, of features [T, ...]."""
+    padded = torch.cat([features.new_zeros(count, features.shape[-1]), features])
     return torch.stack([padded[count - k : len(padded) - k] for k in range(1, count + 1)], dim=1)
 
 
@@ -293,13 +251,13 @@ def twist_of(obs: TensorDictBase, action: Tensor, limits: VelocityLimits) -> Ten
     return torch.cat([velocity / limits.linear, angular / limits.angular], dim=-1)
 
 
-def turned(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Tensor) -> tuple[TensorDict, Tensor]:
+def rotated(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Tensor) -> tuple[TensorDict, Tensor]:
     """The same situation in a scene that is reflected in the plane y = 0 where ``mirrored``, then turned about z.
 
     Points, flow, axes and velocities are vectors; a turning is an axial one, which a reflection also reverses.
 
     Args:
-        inputs: :meth:`Learner.look`'s entries [B].
+        inputs: :meth:`Learner.network_inputs`'s entries [B].
         twist: [B, chunk, 6].
         rotation: [B] rad.
         mirrored: [B] bool.

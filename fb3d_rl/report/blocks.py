@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
+import html
 import textwrap
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import plotly.graph_objects as go
 
-from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
-from fb3d_rl.files import write_text
-from fb3d_rl.report import page
-from fb3d_rl.report.page import text
+from fb3d_rl.report.page import Block, Cell, Row, Table
 
 READING = (
     ("Flow", "direction and relative size of each visible point's motion when the part opens a little; the "
@@ -48,20 +45,6 @@ COPIED = (FACTS["command"],)
 """Facts that one may want to copy."""
 
 
-def write(path: Path, title: str, body: str) -> Path:
-    """Write a page.
-
-    Raises:
-        UserError: it cannot be written.
-    """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, page.page(title, body))
-    except OSError as error:
-        raise UserError(f"Cannot write {path}: {error.strerror}.") from error
-    return path
-
-
 def terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
     """How to read the numbers that ``summaries`` have."""
     names = {name for numbers in summaries for name in tables.policies_of(numbers)}
@@ -76,22 +59,30 @@ def terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
     return [(term, meaning) for term, meaning in READING if told.get(term, True)]
 
 
-def effort(numbers: Mapping[str, Any], colors: Mapping[str, str]) -> str:
+def effort(numbers: Mapping[str, Any], colors: Mapping[str, str]) -> list[Block]:
     """What the trials of each policy took; nothing where no policy in ``colors`` has such numbers."""
     shown = (*tables.EFFORT, tables.DECISION)
-    body = ""
+    rows = []
     for name in tables.effort_of(numbers, list(colors)):
-        body += f'<tr class="mean">{page.named(name, colors[name])}'
-        for metric in shown:
-            key = f"{name}/{metric.key}"
-            body += page.cell(metric.show(numbers.get(key)), metric.show_interval(numbers.get(f"{key}_ci95")))
-        body += "</tr>"
-    return page.plain_table(["policy", *(metric.label for metric in shown)], body) if body else ""
+        keyed = [(metric, f"{name}/{metric.key}") for metric in shown]
+        cells = [Cell(m.show(numbers.get(key)), m.show_interval(numbers.get(f"{key}_ci95"))) for m, key in keyed]
+        rows.append(Row([named(name, colors[name]), *cells]))
+    return [Table.plain(["policy", *(metric.label for metric in shown)], rows)] if rows else []
+
+
+def named(name: str, color: str) -> Cell:
+    """A cell with the name and the colour of a policy or run."""
+    return Cell(name, word=True, color=color)
+
+
+def literal(value: object) -> str:
+    """A string from outside as a label of a figure: plotly.js takes a label's tags for its own."""
+    return html.escape(str(value))
 
 
 def broken(label: str) -> str:
     """A label of a figure, long ones on several lines, which leaves the bars their room on a phone."""
-    return "<br>".join(map(text, textwrap.wrap(label, 27)))
+    return "<br>".join(map(literal, textwrap.wrap(label, 27)))
 
 
 def bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: Sequence[tuple[Any, Any]]) -> None:
@@ -100,7 +91,7 @@ def bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: S
     ends = [interval if interval is not None else (value, value) for _, value, interval in known]
     plot.add_bar(
         orientation="h",
-        name=text(name),
+        name=literal(name),
         marker={"color": color, "opacity": 0.5},
         y=[broken(label) for label, _, _ in known],
         x=[value for _, value, _ in known],
@@ -113,5 +104,5 @@ def bars(plot: go.Figure, name: str, color: str, labels: Sequence[str], cells: S
             "thickness": 1.8,
             "width": 3,
         },
-        hovertemplate="%{y}: %{x:.2f}<extra>" + text(name) + "</extra>",
+        hovertemplate="%{y}: %{x:.2f}<extra>" + literal(name) + "</extra>",
     )

@@ -9,26 +9,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.evaluation.runs import CLOUD_ARRAYS
-from fb3d_rl.report import page
+from fb3d_rl.report.page import Block, Note, Viewer
 
 _ARROWS = 160
 """Arrows per cloud: more hide the shape."""
 
 
-def viewer(clouds: Mapping[str, NDArray[Any]] | None) -> str:
-    """The arrays of ``clouds.npz`` (see :data:`CLOUD_ARRAYS`) as a block; nothing without any."""
+def viewer(clouds: Mapping[str, NDArray[Any]] | None) -> list[Block]:
+    """The arrays of ``clouds.npz`` (see :data:`CLOUD_ARRAYS`) as blocks; nothing without any."""
     if clouds is None:
-        return ""
+        return []
     samples = zip(*(clouds[name] for name in CLOUD_ARRAYS), strict=True)
     prepared = [_cloud(*sample) for sample in samples if sample[1].any()]
     if not prepared:
-        return ""
+        return []
     note = (
         "The same cloud twice; drag to turn, scroll to zoom. Arrows start at the same points on both sides, "
         "chosen among those that move or are predicted to move (flow above 0.1); arrows below 0.02 are "
         "left out."
     )
-    return f'<p class="soft">{note}</p>' + page.viewer(prepared)
+    return [Note(note), Viewer(prepared)]
 
 
 def _cloud(
@@ -39,7 +39,7 @@ def _cloud(
     flow_predicted: NDArray[np.float32],
     title: str,
 ) -> dict[str, Any]:
-    """One cloud for :func:`page.viewer`; arrays [N, ...], padding dropped."""
+    """One cloud for :class:`Viewer`; arrays [N, ...], padding dropped."""
     points, part = points[valid], part_mask[valid]
     true, predicted = flow_true[valid], flow_predicted[valid]
     low, high = points.min(0), points.max(0)

@@ -10,11 +10,19 @@ import plotly.graph_objects as go
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import comparison, tables
 from fb3d_rl.evaluation.comparison import Comparison, Group
+from fb3d_rl.evaluation.comparison_tables import (
+    show_difference,
+    show_labels,
+    show_seeds,
+    show_share,
+    show_value,
+    write_csv,
+)
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, SUCCESS
 from fb3d_rl.report import curves, failure_charts, page
-from fb3d_rl.report.blocks import COPIED, FACTS, bars, broken, effort, terms, write
-from fb3d_rl.report.gallery import Shown, films, gallery
-from fb3d_rl.report.page import text
+from fb3d_rl.report.blocks import COPIED, FACTS, bars, broken, effort, named, terms
+from fb3d_rl.report.gallery import films, gallery
+from fb3d_rl.report.page import Block, Cell, Facts, Figure, Grid, Heading, Note, Row, Section, Shown, Table
 from fb3d_rl.rollout.rows import TrialRow
 
 
@@ -38,24 +46,23 @@ def write_comparison(found: Comparison, out: Path, unfinished: Sequence[Path] = 
     logs = [(group.label, colors[group.label], [run.log for run in group.runs]) for group in found.groups]
     learned = curves.learning_curves(logs)
     steps = [(name, color, log) for name, color, of_runs in logs for log in of_runs]
-    body = (
-        f"<header><h1>{_title(found)}</h1>{_left_out(unfinished)}</header>"
-        + page.section("Results", _entry_table(found, colors), _split_entries(found, colors))
-        + page.section("Side by side", _entry_bars(found, colors))
-        + page.section("How trials ended", _ends(found))
-        + page.section("What it took", effort(found.numbers, colors))
-        + page.section("Differences on the same trials", _difference_tables(found, colors))
-        + page.section("Success by category", _entry_categories(found, colors))
-        + page.section("Trials", _trials(found, colors))
-        + page.section("Learning curves", learned)
-        + page.section("Flow", _flow_table(found))
-        + page.section("Training", curves.training(steps, skip=curves.OVER_LABELS if learned else ()))
-        + page.section("How the numbers come about", _told(found))
-        + page.section("What was run", *map(_group_facts, found.groups))
-    )
-    write(out, "Comparison · fb3d_rl", body)
+    sections = [
+        Section("Results", [*_entry_table(found, colors), *_split_entries(found, colors)]),
+        Section("Side by side", _entry_bars(found, colors)),
+        Section("How trials ended", _ends(found)),
+        Section("What it took", effort(found.numbers, colors)),
+        Section("Differences on the same trials", _difference_tables(found, colors)),
+        Section("Success by category", _entry_categories(found, colors)),
+        Section("Trials", _trials(found, colors)),
+        Section("Learning curves", learned),
+        Section("Flow", _flow_table(found)),
+        Section("Training", curves.training(steps, skip=curves.OVER_LABELS if learned else ())),
+        Section("How the numbers come about", [_told(found)]),
+        Section("What was run", [block for group in found.groups for block in _group_facts(group)]),
+    ]
+    page.write(out, "Comparison · fb3d_rl", _title(found), _left_out(unfinished), sections)
     try:
-        comparison.write_csv(found, out.with_suffix(".csv"))
+        write_csv(found, out.with_suffix(".csv"))
     except OSError as error:
         raise UserError(f"Cannot write {out.with_suffix('.csv')}: {error.strerror}.") from error
     return out
@@ -66,52 +73,48 @@ def _title(found: Comparison) -> str:
     return f"Comparison of {count} run{'s' * (count != 1)}"
 
 
-def _left_out(unfinished: Sequence[Path]) -> str:
-    if not unfinished:
-        return ""
+def _left_out(unfinished: Sequence[Path]) -> list[Block]:
     names = ", ".join(path.name for path in unfinished)
-    return f'<p class="error">Left out, not finished (no summary.json): {text(names)}</p>'
+    return [Note(f"Left out, not finished (no summary.json): {names}", wrong=True)] if unfinished else []
 
 
-def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> str:
+def _entry_table(found: Comparison, colors: Mapping[str, str], split: str = "") -> list[Block]:
     """A row per policy; of one split, or of all trials."""
     numbers = found.numbers["by_split"][split] if split else found.numbers
     entries = [entry for entry in found.entries if f"{entry.label}/n" in numbers]
     if not entries:
-        return ""
+        return []
     several = not split and any(len(entry.seeds) > 1 for entry in entries)
     labelled = not split and any(entry.labels is not None for entry in entries)
     head = ["policy", "success", "success, class mean"] + ["success, range over seeds"] * several
     head += ["contact", "normalized distance"] + ["labels", "expert steps"] * labelled
-    body = ""
+    rows = []
     for entry in entries:
-        body += f'<tr class="mean">{page.named(entry.label, colors[entry.label])}'
-        body += page.cell(*comparison.cells(entry, numbers, SUCCESS))
-        body += page.cell(*comparison.cells(entry, numbers, SUCCESS, "_class_mean"))
+        cells = [
+            named(entry.label, colors[entry.label]),
+            Cell(*show_value(entry, numbers, SUCCESS)),
+            Cell(*show_value(entry, numbers, SUCCESS, "_class_mean")),
+        ]
         if several:
-            body += page.cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–")
-        body += page.cell(*comparison.cells(entry, numbers, CONTACT)) + page.cell(
-            *comparison.cells(entry, numbers, DISTANCE)
-        )
+            cells.append(Cell(SUCCESS.show_interval(entry.seed_range(SUCCESS)) or "–"))
+        cells += [Cell(*show_value(entry, numbers, metric)) for metric in (CONTACT, DISTANCE)]
         if labelled:
-            body += page.cell(comparison.show_labels(entry.labels)) + page.cell(
-                comparison.show_share(entry.expert_share)
-            )
-        body += "".join(f"<td>{numbers[f'{entry.label}/{key}']}</td>" for key in ("n", "n_objects"))
-        body += f"<td>{text(comparison.show_seeds(entry))}</td>"
-        body += "</tr>"
-    note = "" if split else '<p class="soft">Small print: 95 % intervals with objects as the unit, see below.</p>'
-    return note + page.plain_table([*head, "trials", "objects", "seeds"], body)
+            cells.append(Cell(show_labels(entry.labels)))
+            cells.append(Cell(show_share(entry.expert_share)))
+        cells += [Cell(str(numbers[f"{entry.label}/{key}"])) for key in ("n", "n_objects")]
+        rows.append(Row([*cells, Cell(show_seeds(entry))]))
+    note = Note("Small print: 95 % intervals with objects as the unit, see below.")
+    return [*[note] * (not split), Table.plain([*head, "trials", "objects", "seeds"], rows)]
 
 
-def _split_entries(found: Comparison, colors: Mapping[str, str]) -> str:
+def _split_entries(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
     splits = found.numbers.get("by_split", {})
-    return "".join(f"<h3>Split {text(name)}</h3>{_entry_table(found, colors, name)}" for name in splits)
+    return [block for name in splits for block in (Heading(f"Split {name}"), *_entry_table(found, colors, name))]
 
 
-def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
+def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
     """Instance means in the policies' colours."""
-    blocks = []
+    figures = []
     lines = max((1 + broken(entry.label).count("<br>") for entry in found.entries), default=1)
     for metric in (SUCCESS, DISTANCE) if found.entries else ():
         plot = go.Figure()
@@ -135,62 +138,58 @@ def _entry_bars(found: Comparison, colors: Mapping[str, str]) -> str:
         )
         if metric.percent:
             plot.update_xaxes(range=[0, 1.02])
-        blocks.append(page.figure(metric.key, plot))
-    return page.grid(blocks) if blocks else ""
+        figures.append(Figure.of(metric.key, plot))
+    return [Grid(figures)] if figures else []
 
 
-def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> str:
-    bodies: dict[str, str] = {}
+def _difference_tables(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
+    rows: dict[str, list[Row]] = {}
     for three in comparison.by_pair(found):
         label = three[0].entry.label
-        row = f'<tr class="mean">{page.named(label, colors[label])}{page.cell(str(three[0].n))}'
-        row += "".join(page.cell(*comparison.show_difference(d.metric, d.means)) for d in three)
-        bodies[three[0].baseline.label] = bodies.get(three[0].baseline.label, "") + row + "</tr>"
+        cells = [Cell(*show_difference(d.metric, d.means)) for d in three]
+        row = Row([named(label, colors[label]), Cell(str(three[0].n)), *cells])
+        rows.setdefault(three[0].baseline.label, []).append(row)
     head = ("policy", "trials", *(m.label + ", points" * m.percent for m in comparison.DIFFERENCES))
-    return "".join(f"<h3>Minus {text(name)}</h3>{page.plain_table(head, body)}" for name, body in bodies.items())
+    return [block for name, of in rows.items() for block in (Heading(f"Minus {name}"), Table.plain(head, of))]
 
 
-def _entry_categories(found: Comparison, colors: Mapping[str, str]) -> str:
+def _entry_categories(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
     if not found.entries:
-        return ""
-    body = ""
+        return []
+    rows = []
     for category, values in found.numbers["by_category"].items():
-        shown = (comparison.cells(entry, values, SUCCESS) for entry in found.entries)
         objects = {(r.category, r.object) for e in found.entries for r in e.rows.values() if r.category == category}
-        cells = page.cell(str(len(objects))) + "".join(page.cell(*cell) for cell in shown)
-        body += f'<tr class="mean"><td class="text">{text(category)}</td>{cells}</tr>'
-    head = "".join(
-        f'<th class="group" style="--swatch:{colors[entry.label]}">{text(entry.label)}</th>' for entry in found.entries
-    )
-    head = f'<th class="text">category</th><th>objects</th>{head}'
-    return page.table(f"<tr>{head}</tr>", body)
+        cells = [Cell(*show_value(entry, values, SUCCESS)) for entry in found.entries]
+        rows.append(Row([Cell(category, word=True), Cell(str(len(objects))), *cells]))
+    labels = [Cell(entry.label, color=colors[entry.label]) for entry in found.entries]
+    return [Table([[Cell("category", word=True), Cell("objects"), *labels]], [rows])]
 
 
-def _flow_table(found: Comparison) -> str:
+def _flow_table(found: Comparison) -> list[Block]:
     """A row per group that measured a flow network, all seeds together."""
-    body = ""
+    table = []
     for group in found.groups:
         rows = [row for run in group.runs for row in run.flow]
         if not rows:
             continue
-        cells = page.cell(str(sum(bool(run.flow) for run in group.runs))) + page.cell(str(len(rows)))
+        cells = [Cell(str(sum(bool(run.flow) for run in group.runs))), Cell(str(len(rows)))]
         for metric in FLOW:
             measured = tables.measure(rows, metric)
-            cells += page.cell(metric.show(measured.instance), metric.show_interval(measured.instance_ci95))
-            cells += page.cell(metric.show(measured.class_), metric.show_interval(measured.class_ci95))
-        body += f'<tr class="mean"><td class="text">{text(group.label)}</td>{cells}</tr>'
+            cells.append(Cell(metric.show(measured.instance), metric.show_interval(measured.instance_ci95)))
+            cells.append(Cell(metric.show(measured.class_), metric.show_interval(measured.class_ci95)))
+        table.append(Row([Cell(group.label, word=True), *cells]))
     names = (metric.label.removeprefix("flow ") for metric in FLOW)
     head = ["run", "seeds", "clouds", *(cell for name in names for cell in (name, f"{name}, class mean"))]
-    return page.plain_table(head, body) if body else ""
+    return [Table.plain(head, table)] if table else []
 
 
-def _told(found: Comparison) -> str:
+def _told(found: Comparison) -> Facts:
     labelled = any(entry.labels is not None for entry in found.entries)
     read = terms([run.summary for group in found.groups for run in group.runs])
-    return page.facts([*read, *(entry for entry in comparison.METHOD if entry[0] != "Labels" or labelled)])
+    return Facts([*read, *(entry for entry in comparison.METHOD if entry[0] != "Labels" or labelled)])
 
 
-def _group_facts(group: Group) -> str:
+def _group_facts(group: Group) -> list[Block]:
     """What was run, told once where all runs of the group agree."""
     facts: list[tuple[str, object]] = [("Runs", ", ".join(group.names))]
     for key, label in FACTS.items():
@@ -199,14 +198,14 @@ def _group_facts(group: Group) -> str:
             facts += [(label, value) for value in values]
         elif values:
             facts.append((label, ", ".join(values) if key in ("seed", "git_revision") else " | ".join(values)))
-    return f"<h3>{text(group.label)}</h3>{page.facts(facts, COPIED)}"
+    return [Heading(group.label), Facts(facts, COPIED)]
 
 
-def _ends(found: Comparison) -> str:
+def _ends(found: Comparison) -> list[Block]:
     return failure_charts.blocks({entry.label: list(entry.rows.values()) for entry in found.entries})
 
 
-def _trials(found: Comparison, colors: Mapping[str, str]) -> str:
+def _trials(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
     """The trials of all entries, those on the same part beside each other."""
     filmed = {
         (run.path, *_about(run.seed, row)): path

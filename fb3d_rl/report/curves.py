@@ -11,7 +11,8 @@ import plotly.graph_objects as go
 from fb3d_rl.evaluation import learning
 from fb3d_rl.evaluation.learning import is_number
 from fb3d_rl.report import page
-from fb3d_rl.report.page import text
+from fb3d_rl.report.blocks import literal
+from fb3d_rl.report.page import Block, Figure, Grid, Legend, Note
 
 DASHES = ("solid", "dot", "dash")
 
@@ -40,11 +41,11 @@ class Line:
     dash: str = "solid"
 
 
-def panel(id_: str, title: str, x_title: str, lines: Sequence[Line], *, legend: bool, percent: bool = False) -> str:
+def panel(id_: str, title: str, x_title: str, lines: Sequence[Line], *, legend: bool, percent: bool = False) -> Figure:
     """One small figure. A line of a single point becomes a dot with a bar; positive losses get a log axis."""
     plot = go.Figure()
     for line in lines:
-        name, dots = text(line.name), len(line.x) < 16
+        name, dots = literal(line.name), len(line.x) < 16
         trace: dict[str, Any] = {
             "x": list(line.x),
             "y": list(line.y),
@@ -69,7 +70,7 @@ def panel(id_: str, title: str, x_title: str, lines: Sequence[Line], *, legend: 
     plot.update_layout(
         template="none",
         height=270,
-        title={"text": text(title), "font": {"size": 14}, "x": 0, "xanchor": "left", "xref": "container", "y": 0.97},
+        title={"text": literal(title), "font": {"size": 14}, "x": 0, "xanchor": "left", "xref": "container", "y": 0.97},
         margin={"l": 52, "r": 12, "t": 56 if legend else 36, "b": 42},
         showlegend=legend,
         legend={"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
@@ -81,10 +82,10 @@ def panel(id_: str, title: str, x_title: str, lines: Sequence[Line], *, legend: 
     elif not percent and all(value == 0 for line in lines for value in line.y):
         # By itself the axis would go below 0, where a count cannot be.
         plot.update_yaxes(range=[-0.02, 1.02])
-    return page.figure(id_, plot)
+    return Figure.of(id_, plot)
 
 
-def training(logs: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], skip: Sequence[str] = ()) -> str:
+def training(logs: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], skip: Sequence[str] = ()) -> list[Block]:
     """Curves over steps, a panel per quantity ("train/loss" and "val/loss" share the panel "loss").
 
     Args:
@@ -117,18 +118,18 @@ def training(logs: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], skip:
             panels.setdefault(quantity, []).append(line)
     panels = {name: lines for name, lines in panels.items() if any(len(line.x) > 1 for line in lines)}
     if not panels:
-        return ""
-    blocks = [
+        return []
+    figures = [
         panel(f"training-{i}", name.replace("_", " "), "step", lines, legend=not several and len(prefixes) > 1)
         for i, (name, lines) in enumerate(panels.items())
     ]
-    head = ""
+    head: list[Block] = []
     if several:
-        head = page.legend({name: color for name, color, _ in logs}.items())
+        head.append(Legend(list({name: color for name, color, _ in logs}.items())))
         if len(prefixes) > 1:
             told = ", ".join(f"{prefix} {DASHES[i % len(DASHES)]}" for i, prefix in enumerate(prefixes))
-            head += f'<p class="soft">A line for each run; lines: {text(told)}.</p>'
-    return head + page.grid(blocks)
+            head.append(Note(f"A line for each run; lines: {told}."))
+    return [*head, Grid(figures)]
 
 
 def once_a_round(log: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -138,10 +139,10 @@ def once_a_round(log: Sequence[Mapping[str, Any]]) -> list[str]:
     return [key for key in keys if count > 1 and sum(is_number(row.get(key)) for row in log) <= count]
 
 
-def learning_curve(log: Sequence[Mapping[str, Any]]) -> str:
+def learning_curve(log: Sequence[Mapping[str, Any]]) -> list[Block]:
     """What a run of several rounds learned from how many labels; nothing for other runs."""
     if len(learning.rounds(log)) < 2:
-        return ""
+        return []
     blocks = []
     for title, keys in LEARNING.items():
         found = {name: learning.curve([log], key) for key, name in keys.items()}
@@ -152,10 +153,10 @@ def learning_curve(log: Sequence[Mapping[str, Any]]) -> str:
         ]
         if lines:
             blocks.append(panel(f"learning-{title}", title, "labels", lines, legend=True, percent=title != "loss"))
-    return page.grid(blocks)
+    return [Grid(blocks)] if blocks else []
 
 
-def learning_curves(groups: Sequence[tuple[str, str, Sequence[Sequence[Mapping[str, Any]]]]]) -> str:
+def learning_curves(groups: Sequence[tuple[str, str, Sequence[Sequence[Mapping[str, Any]]]]]) -> list[Block]:
     """Success over labels and over rounds of groups of runs, their mean and the band from lowest to highest.
 
     Args:
@@ -178,8 +179,8 @@ def learning_curves(groups: Sequence[tuple[str, str, Sequence[Sequence[Mapping[s
             ]  # fmt: skip
             blocks.append(panel(f"success-{k}-{x_title}", title, x_title, lines, legend=False, percent=True))
     if not blocks:
-        return ""
+        return []
     note = "Mean over seeds; the band goes from the lowest to the highest seed."
     if any(len(learning.rounds(log)) == 1 for _, _, logs in groups for log in logs):
         note += " A dot: a single round."
-    return page.legend(shown.items()) + f'<p class="soft">{note}</p>' + page.grid(blocks)
+    return [Legend(list(shown.items())), Note(note), Grid(blocks)]

@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 import plotly.graph_objects as go
 
 from fb3d_rl.evaluation.failures import ENDS, HELD, NOT_FAR, SCHEDULED, TOUCHED, end, in_order, stages
-from fb3d_rl.report import page
-from fb3d_rl.report.blocks import broken
-from fb3d_rl.report.page import text
+from fb3d_rl.report.blocks import broken, literal
+from fb3d_rl.report.page import Block, Choice, Figure, Grid, Legend, Titled
 from fb3d_rl.rollout.rows import NEVER_HELD, NEVER_TOUCHED, TrialRow
 
 _OTHER = "#7d8597"
@@ -30,7 +29,7 @@ _HEIGHT, _GAP = 270, 20
 """Height (pixels) of the flow chart, and of the gap between two nodes of it."""
 
 
-def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> str:
+def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> list[Block]:
     """A flow chart for each group of trials, such as a policy's, and where there are several, bars beside each other.
 
     Args:
@@ -40,12 +39,12 @@ def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> str:
     if len(charts) > 2:
         # The expert's chart tells the least.
         chosen = sorted(charts, key=lambda chart: all(row.policy == "expert" for row in groups[chart[0]]))
-        return bars("ends", groups) + page.choice("stages of the trials of", chosen)
-    titled = (f"<div><h3>{text(name)}</h3>{chart}</div>" for name, chart in charts)
-    return (page.grid(titled) if charts else "") + (bars("ends", groups) if len(groups) > 1 else "")
+        return [*bars("ends", groups), Choice("stages of the trials of", chosen)]
+    titled = [Titled(name, chart) for name, chart in charts]
+    return [Grid(titled)] * bool(charts) + (bars("ends", groups) if len(groups) > 1 else [])
 
 
-def flow_chart(id_: str, rows: Sequence[TrialRow]) -> str:
+def flow_chart(id_: str, rows: Sequence[TrialRow]) -> Figure:
     """The stages of one policy's trials: each band is as wide as many trials went that way."""
     steps: Counter[tuple[str, str]] = Counter()
     for row in rows:
@@ -62,7 +61,7 @@ def flow_chart(id_: str, rows: Sequence[TrialRow]) -> str:
         go.Sankey(
             arrangement="fixed",
             node={
-                "label": [f"{text(_SHORT.get(name, name))} {count}" for name, count in counts.items()],
+                "label": [f"{literal(_SHORT.get(name, name))} {count}" for name, count in counts.items()],
                 "color": [_STAGE if name in through else ENDS.get(name, _OTHER) for name in names],
                 "align": "left",
                 "x": x,
@@ -77,13 +76,13 @@ def flow_chart(id_: str, rows: Sequence[TrialRow]) -> str:
                 "target": [names.index(b) for _, b in order],
                 "value": [steps[step] for step in order],
                 "color": [_THROUGH if b in through else _faint(ENDS.get(b, _OTHER)) for _, b in order],
-                "customdata": [text(f"{a} → {b}: {steps[a, b]} of {len(rows)}") for a, b in order],
+                "customdata": [literal(f"{a} → {b}: {steps[a, b]} of {len(rows)}") for a, b in order],
                 "hovertemplate": "%{customdata}<extra></extra>",
             },
         )
     )
     plot.update_layout(template="none", height=_HEIGHT + 30, margin={"l": 4, "r": 4, "t": 15, "b": 15})
-    return page.figure(id_, plot)
+    return Figure.of(id_, plot)
 
 
 def _places(steps: Mapping[tuple[str, str], int], counts: Mapping[str, int]) -> tuple[list[float], list[float]]:
@@ -111,7 +110,7 @@ def _faint(shade: str) -> str:
     return f"rgba({red}, {green}, {blue}, 0.5)"
 
 
-def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> str:
+def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> list[Block]:
     """How the trials of each group ended: a stacked bar each, as shares of its trials.
 
     Args:
@@ -127,7 +126,7 @@ def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> str:
         counts = [of_group.get(name, 0) for of_group in counted.values()]
         plot.add_bar(
             orientation="h",
-            name=text(name),
+            name=literal(name),
             y=labels,
             x=[count / len(rows) for count, rows in zip(counts, groups.values(), strict=True)],
             # A number that is wider than its piece of the bar says nothing.
@@ -139,7 +138,7 @@ def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> str:
             constraintext="none",
             marker={"color": ENDS.get(name, _OTHER), "line": {"width": 0}},
             customdata=counts,
-            hovertemplate="%{y}: %{customdata} (%{x:.0%})<extra>" + text(name) + "</extra>",
+            hovertemplate="%{y}: %{customdata} (%{x:.0%})<extra>" + literal(name) + "</extra>",
         )
     plot.update_layout(
         template="none",
@@ -151,4 +150,4 @@ def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> str:
         xaxis={"tickformat": ".0%", "range": [0, 1.02], "title": {"text": "share of trials"}},
         yaxis={"autorange": "reversed", "automargin": True, "ticksuffix": "  "},
     )
-    return page.legend((name, ENDS.get(name, _OTHER)) for name in found) + page.figure(id_, plot)
+    return [Legend([(name, ENDS.get(name, _OTHER)) for name in found]), Figure.of(id_, plot)]

@@ -1,22 +1,29 @@
-"""The look of the reports: one self-contained HTML page with figures that follow the light or dark scheme.
+"""A page as plain data, and the file that the templates make of it.
 
-The page loads nothing: style, scripts (the folder web/) and plotly.js stand inside, and a content security policy
-forbids every request. Whatever is called body, block or cell is HTML already; :func:`text` makes strings from outside
-harmless.
+All HTML stands in the folder templates/, where every string is escaped; the blocks here hold text and numbers. A page
+loads nothing: style, scripts (the folder web/) and plotly.js stand inside, and a content security policy forbids every
+request.
 """
 
 from __future__ import annotations
 
 import base64
-import html
 import json
 import re
-from collections.abc import Container, Iterable, Mapping, Sequence
-from importlib import resources
-from typing import Any
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
 
 import plotly.graph_objects as go
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from plotly.offline import get_plotlyjs
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation.failures import end
+from fb3d_rl.evaluation.tables import DISTANCE
+from fb3d_rl.files import write_text
+from fb3d_rl.rollout.rows import TrialRow
 
 PALETTE = (
     "#3b7dd8", "#e0782f", "#2f9e77", "#a45bd0", "#c9a227", "#d1495b", "#4fa3b5", "#7d8597", "#9c6b3f", "#d96fb0",
@@ -30,230 +37,280 @@ def color(index: int) -> str:
     return PALETTE[index % len(PALETTE)]
 
 
-TRUE, PREDICTED, PART, STATIC = "#2f9e77", "#e0782f", "#3b7dd8", "#98a2b3"
-"""Colours of the viewer: true flow, predicted flow, points of the target part, other points."""
-
-_CSP = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:; media-src data:"
+# ---------------------------------------------------------------------------------------------------------- blocks
 
 
-def text(value: object) -> str:
-    """A string from outside as HTML that shows it literally."""
-    return html.escape(str(value))
+@dataclass(frozen=True)
+class Heading:
+    """A title within a section."""
+
+    text: str
 
 
-def _json(value: object) -> str:
-    # "<" would let a string close the script element.
-    return json.dumps(value, allow_nan=False).replace("<", "\\u003c")
+@dataclass(frozen=True)
+class Note:
+    """A sentence, such as how to read what follows, or what is wrong."""
+
+    text: str
+    wrong: bool = False
 
 
-# --------------------------------------------------------------------------------------------------------- figures
+@dataclass(frozen=True)
+class Source:
+    """The text of a file."""
+
+    text: str
 
 
-def figure(id_: str, plot: go.Figure) -> str:
-    """A plotly figure as a block of the page."""
-    return (
-        f'<div class="panel"><div id="{id_}"></div></div>'
-        f'<script type="application/json" data-figure="{id_}">{_safe_figure(plot)}</script>'
-    )
+@dataclass(frozen=True)
+class Facts:
+    """Names and their values; a button copies the values of the names in ``copied``."""
+
+    entries: Sequence[tuple[str, object]]
+    copied: Container[str] = ()
 
 
-def _safe_figure(plot: go.Figure) -> str:
-    content: str = plot.to_json()  # turns NaN to null, unlike json
-    return content.replace("<", "\\u003c")
+@dataclass(frozen=True)
+class Cards:
+    """Headline numbers: (name, value, lines of small print) each."""
+
+    entries: Sequence[tuple[str, str, Sequence[str]]]
 
 
-def viewer(clouds: Sequence[dict[str, Any]]) -> str:
+@dataclass(frozen=True)
+class Legend:
+    """Names with their colours, for several figures."""
+
+    entries: Sequence[tuple[str, str]]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A plotly figure; ``id`` is unique on the page."""
+
+    id: str
+    content: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, id_: str, plot: go.Figure) -> Figure:
+        """The figure as plain data, in which NaN is None."""
+        return cls(id_, json.loads(plot.to_json()))
+
+
+@dataclass(frozen=True)
+class Viewer:
     """Two linked 3D scenes, true next to predicted flow, on a narrow page one above the other.
 
-    Args:
-        clouds: per cloud "title"; "rest" and "part": coordinates of the points as [3][n] lists; "true" and
-            "predicted": {"start": [a][3], "vector": [a][3]}; "box": range of each axis, [3][2]; "size":
+    Attributes:
+        clouds: per cloud "title"; "rest" and "part": coordinates of the points, three lists of n; "true" and
+            "predicted": {"start", "vector"}, lists of a triples; "box": range of each axis, three pairs; "size":
             length (m) at which a flow of norm 1 is drawn.
     """
-    colors = {"rest": STATIC, "part": PART, "true": TRUE, "predicted": PREDICTED}
-    names = (("part to open", PART), ("other points", STATIC), ("true flow", TRUE), ("predicted flow", PREDICTED))
-    content = _json({"clouds": list(clouds), "colors": colors})
-    return (
-        '<div class="panel"><div class="bar"><button id="cloud-back" aria-label="previous cloud">‹</button>'
-        '<select id="cloud-choice" aria-label="cloud"></select>'
-        '<button id="cloud-next" aria-label="next cloud">›</button>'
-        f'<button id="cloud-reset">reset view</button></div>{legend(names)}<div id="viewer"></div></div>'
-        f'<script type="application/json" id="clouds">{content}</script>'
-    )
+
+    clouds: Sequence[Mapping[str, Any]]
 
 
-# ---------------------------------------------------------------------------------------------------------- tables
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a table.
+
+    Attributes:
+        text: what it says; a line break in it stays one.
+        small: small print below.
+        word: stands on the left, as words do.
+        first: the first of a group of columns.
+        color: of the policy or run that it names.
+        columns: how many columns it spans.
+        rows: how many rows it spans.
+    """
+
+    text: str
+    small: str = ""
+    word: bool = False
+    first: bool = False
+    color: str = ""
+    columns: int = 1
+    rows: int = 1
 
 
-def cell(value: str, small: str = "") -> str:
-    """A cell with small print below."""
-    return f"<td>{value}<small>{small}</small></td>"
+@dataclass(frozen=True)
+class Row:
+    """A row of a table, bold but for its small print where it holds means."""
+
+    cells: Sequence[Cell]
+    mean: bool = True
 
 
-def named(name: str, shade: str) -> str:
-    """A cell with the name (plain text) and the colour of a policy or run."""
-    return f'<td class="text named">{swatch(shade)}{text(name)}</td>'
-
-
-def table(head: str, *bodies: str, scroll: bool = False) -> str:
+@dataclass(frozen=True)
+class Table:
     """A table that sorts by the column whose head is clicked.
 
-    Args:
-        head: its rows of heads, of which those with a ``colspan`` stand above the columns' own.
-        bodies: rows; the first body is what sorts, those below it (means) stay where they are.
+    Attributes:
+        head: its rows of heads, of which those that span columns stand above the columns' own.
+        bodies: the first body is what sorts, those below it (means) stay where they are.
         scroll: as high as a screen at most.
     """
-    content = "".join(f"<tbody>{body}</tbody>" for body in bodies)
-    return (
-        f'<div class="panel {"scroll" if scroll else "wide"}"><table class="sortable"><thead>{head}</thead>'
-        f"{content}</table></div>"
-    )
+
+    head: Sequence[Sequence[Cell]]
+    bodies: Sequence[Sequence[Row]]
+    scroll: bool = False
+
+    @classmethod
+    def plain(cls, names: Sequence[str], rows: Sequence[Row]) -> Table:
+        """A table with these heads, of which the first column is words."""
+        return cls([[Cell(name, word=i == 0) for i, name in enumerate(names)]], [rows])
 
 
-def plain_table(head: Sequence[str], body: str) -> str:
-    """A table with these heads, plain text, of which the first column is text."""
-    first, *others = head
-    cells = f'<th class="text">{text(first)}</th>' + "".join(f"<th>{text(name)}</th>" for name in others)
-    return table(f"<tr>{cells}</tr>", body)
+@dataclass(frozen=True)
+class Titled:
+    """A block with a title of its own, in a grid."""
+
+    title: str
+    block: Block
 
 
-# ----------------------------------------------------------------------------------------------- choices and filters
+@dataclass(frozen=True)
+class Grid:
+    """Blocks side by side, as many as fit."""
+
+    blocks: Sequence[Block]
 
 
-def choice(label: str, blocks: Sequence[tuple[str, str]]) -> str:
-    """One of several titled blocks, whichever a list of their titles (plain text) names; the first to begin with."""
-    if len(blocks) == 1:
-        return blocks[0][1]
-    options = "".join(f"<option>{text(title)}</option>" for title, _ in blocks)
-    content = "".join(
-        f'<div class="chosen"{" hidden" if i else ""}>{block}</div>' for i, (_, block) in enumerate(blocks)
-    )
-    return (
-        f'<div class="choice"><div class="bar"><label>{text(label)} <select>{options}</select></label></div>'
-        f"{content}</div>"
-    )
+@dataclass(frozen=True)
+class Choice:
+    """One of several titled blocks, whichever a list of their titles names; the first to begin with."""
+
+    label: str
+    options: Sequence[tuple[str, Block]]
 
 
-def filters(fields: Iterable[tuple[str, str, Sequence[tuple[str, Mapping[str, int]]]]], noun: str, body: str) -> str:
-    """Lists that choose which of a body's elements are shown, and the count of these.
+@dataclass(frozen=True)
+class Shown:
+    """A trial of the page.
 
-    Args:
-        fields: (what the list chooses, title of "all", groups of choices) of each list. A group is (field, choices
-            with how many there are of each), plain text; it chooses elements with that ``data-<field>``.
-        noun: what is counted, such as "trials".
-        body: has the elements, those with a ``data-item``; the elements of one item share its value.
+    Attributes:
+        row: the trial.
+        policy: the name of its policy on the page.
+        color: of the policy.
+        film: path of its video and its filmstrip without their suffixes, if it was filmed.
+        seed: of the run.
     """
-    lists = ""
-    for label, everything, groups in fields:
-        options = f'<option value="">{text(everything)}</option>'
-        for field, choices in groups:
-            options += "".join(
-                f'<option value="{text(f"{field}:{value}")}">{text(value)} ({count})</option>'
-                for value, count in choices.items()
-            )
-        lists += f'<select aria-label="{text(label)}">{options}</select>'
-    return f'<div class="filters"><div class="bar">{lists}<output data-noun="{text(noun)}"></output></div>{body}</div>'
+
+    row: TrialRow
+    policy: str
+    color: str
+    film: Path | None
+    seed: int | None
+
+    @property
+    def outcome(self) -> str:
+        """What filters call a success or a failure."""
+        return "opened" if self.row.success else "failed"
+
+    @property
+    def end(self) -> str:
+        """How it ended, failures by their reason."""
+        return end(self.row)
+
+    @property
+    def distance(self) -> str:
+        """The normalized distance that is left, for people."""
+        return DISTANCE.show(self.row.normalized_distance)
 
 
-def item(number: int, fields: Mapping[str, str]) -> str:
-    """The attributes that make an element one of those that :func:`filters` shows or hides."""
-    return f'data-item="{number}" ' + " ".join(f'data-{name}="{text(value)}"' for name, value in fields.items())
+@dataclass(frozen=True)
+class Film:
+    """A film inside the page: an MP4 file, or a wide WebP picture of moments side by side."""
+
+    content: bytes
+    video: bool
 
 
-# ----------------------------------------------------------------------------------------------------------- others
+Filter: TypeAlias = tuple[str, str, Sequence[tuple[str, Mapping[str, int]]]]
+"""What a list chooses, the title of "all", and groups of choices: a field with how many trials have each value."""
 
 
-def grid(blocks: Iterable[str], size: str = "") -> str:
-    """Blocks side by side, as many as fit; ``size`` "small" fits more of them."""
-    return f'<div class="grid {size}">{"".join(blocks)}</div>'
+@dataclass(frozen=True)
+class Gallery:
+    """Films and the list of all trials below one bar of filters, which hold for both.
+
+    Attributes:
+        trials: all trials.
+        films: films of the trials with these places.
+        more: how many films the page has no room for.
+        filters: lists that choose which trials are shown.
+    """
+
+    trials: Sequence[Shown]
+    films: Mapping[int, Film]
+    more: int
+    filters: Sequence[Filter]
 
 
-def _data(kind: str, content: bytes) -> str:
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def video(content: bytes) -> str:
-    """An MP4 file inside the page."""
-    source = _data("video/mp4", content)
-    return f'<video controls muted loop playsinline preload="metadata" src="{source}"></video>'
-
-
-def strip(title: str, content: bytes) -> str:
-    """A wide WebP picture inside the page, which scrolls where the page is narrow; ``title`` is plain text."""
-    return f'<div class="strip"><img alt="{text(title)}" src="{_data("image/webp", content)}"></div>'
-
-
-def swatch(shade: str) -> str:
-    """A dot in a policy's colour."""
-    return f'<span class="dot" style="background:{shade}"></span>'
-
-
-def legend(entries: Iterable[tuple[str, str]]) -> str:
-    """Names with their colours, for several figures; plain text."""
-    return (
-        f'<div class="legend">{"".join(f"<span>{swatch(shade)}{text(name)}</span>" for name, shade in entries)}</div>'
-    )
-
-
-def cards(entries: Iterable[tuple[str, str, Sequence[str]]]) -> str:
-    """Headline numbers: (name, value, lines of small print) each, plain text."""
-    return (
-        '<div class="cards">'
-        + "".join(
-            f'<div class="card"><div class="name">{text(name)}</div><div class="value">{text(value)}</div>'
-            f'<div class="more">{"<br>".join(map(text, more))}</div></div>'
-            for name, value, more in entries
-        )
-        + "</div>"
-    )
-
-
-def facts(entries: Iterable[tuple[str, object]], copied: Container[str] = ()) -> str:
-    """A list of names and values, plain text; values of the names in ``copied`` have a button that copies them."""
-    shown = ""
-    for name, value in entries:
-        content = text(value)
-        if name in copied:
-            content = f'<code>{content}</code> <button class="copy" aria-label="copy {text(name)}">copy</button>'
-        shown += f"<dt>{text(name)}</dt><dd>{content}</dd>"
-    return f"<dl>{shown}</dl>"
+Block: TypeAlias = (
+    Heading | Note | Source | Facts | Cards | Legend | Figure | Viewer | Table | Titled | Grid | Choice | Gallery
+)
+"""What a section is made of: the template blocks.html has a macro for each."""
 
 
 # ------------------------------------------------------------------------------------------------------------ pages
 
 
-def section(title: str, *blocks: str) -> str:
-    """A titled section; nothing at all if every block is empty."""
-    content = "".join(blocks)
-    name = re.sub(r"\W+", "-", title.lower())
-    return f'<section id="{name}"><h2>{text(title)}</h2>{content}</section>' if content else ""
+@dataclass(frozen=True)
+class Section:
+    """A titled section; a page leaves out those without any block."""
+
+    title: str
+    blocks: Sequence[Block]
+
+    @property
+    def id(self) -> str:
+        """What links name it by."""
+        return re.sub(r"\W+", "-", self.title.lower())
 
 
-def page(title: str, body: str) -> str:
-    """The whole page. ``title`` is plain text, ``body`` HTML made by this module."""
-    figures = "data-figure=" in body
-    clouds = 'id="viewer"' in body
-    scripts = [_web("tools.js")]
-    if figures or clouds:
-        scripts = [get_plotlyjs(), *scripts, _web("figures.js")]
-    if clouds:
-        scripts.append(_web("viewer.js"))
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_CSP}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(title)}</title><style>{_web('page.css')}</style></head>"
-        f"<body>{_contents(body)}<main>{body}</main>"
-        f"{''.join(f'<script>{script}</script>' for script in scripts)}</body></html>\n"
-    )
-
-
-def _contents(body: str) -> str:
-    """A line of links to the sections of ``body``."""
-    found = re.findall(r'<section id="([^"]+)"><h2>(.*?)</h2>', body)
-    links = "".join(f'<a href="#{name}">{title}</a>' for name, title in found)
-    return f'<nav aria-label="sections"><div>{links}</div></nav>' if links else ""
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
 
 
 def _web(name: str) -> str:
-    return resources.files(__package__).joinpath("web", name).read_text("utf-8")
+    return Path(__file__).with_name("web").joinpath(name).read_text("utf-8")
+
+
+_TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).with_name("templates")),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+_TEMPLATES.filters |= {"base64": _base64, "kind": lambda block: type(block).__name__}
+_TEMPLATES.globals |= {"web": _web, "plotly_js": get_plotlyjs}
+_TEMPLATES.policies["json.dumps_kwargs"] = {"allow_nan": False}
+
+
+def render(template: str, **content: object) -> str:
+    """The whole page that a template makes of ``content``."""
+    return _TEMPLATES.get_template(template).render(content)
+
+
+def write(path: Path, title: str, heading: str, header: Sequence[Block], sections: Sequence[Section]) -> Path:
+    """Write a report's page.
+
+    Args:
+        path: where.
+        title: of the browser's window.
+        heading: of the page.
+        header: what stands below the heading.
+        sections: what follows.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    shown = [section for section in sections if section.blocks]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, render("report.html", title=title, heading=heading, header=header, sections=shown))
+    except OSError as error:
+        raise UserError(f"Cannot write {path}: {error.strerror}.") from error
+    return path

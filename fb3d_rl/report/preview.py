@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections.abc import Sequence
 from itertools import groupby
@@ -15,12 +14,14 @@ from PIL import Image, ImageDraw
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.shade import Body, Camera, Part, Studio, link_colors, srgb
+from fb3d_rl.drawing.bodies import Body, Part, link_colors, srgb
+from fb3d_rl.drawing.camera import Camera
 from fb3d_rl.drawing.signs import FAINT, INK, arrow_mesh, font
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.files import write_bytes
 from fb3d_rl.kinematics.opening import openable_links, opening_range, standing_pose
 from fb3d_rl.kinematics.tree import KinematicTree
-from fb3d_rl.report import page
+from fb3d_rl.report.page import render
 
 SIZE = (220, 190)
 """Width and height (pixels) of one picture; an object has two of them, side by side."""
@@ -144,20 +145,11 @@ def _image(groups: Groups) -> Image.Image:
 
 
 def _html(groups: Groups, title: str) -> str:
-    says = (
-        "Closed and open. What opens is blue; a red arrow lies on the axis of each hinge, or shows where a slider goes."
-    )
-    blocks = [f'<p class="soft">{says}</p>']
-    for category, group in groups:
-        tiles = []
-        for obj, image in group:
-            buffer = io.BytesIO()
-            Image.fromarray(image).save(buffer, "webp", quality=85)
-            data = base64.b64encode(buffer.getvalue()).decode("ascii")
-            name = page.text(_caption(obj))
-            tiles.append(
-                f'<figure class="panel"><img alt="{name}" src="data:image/webp;base64,{data}">'
-                f"<figcaption>{name}</figcaption></figure>"
-            )
-        blocks += [f"<h2>{page.text(category)}</h2>", page.grid(tiles, "small")]
-    return page.page(title, f"<h1>{page.text(title)}</h1>" + "".join(blocks))
+    tiles = [(name, [(_caption(obj), _webp(image)) for obj, image in group]) for name, group in groups]
+    return render("sheet.html", title=title, groups=tiles)
+
+
+def _webp(image: NDArray[np.uint8]) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "webp", quality=85)
+    return buffer.getvalue()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import plotly.graph_objects as go
 
@@ -13,9 +13,9 @@ from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.runs import Run, read_run
 from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, HELD, MOTION_ONLY, SUCCESS, Metric
 from fb3d_rl.report import clouds, curves, failure_charts, page
-from fb3d_rl.report.blocks import COPIED, FACTS, bars, effort, terms, write
-from fb3d_rl.report.gallery import Shown, films, gallery
-from fb3d_rl.report.page import text
+from fb3d_rl.report.blocks import COPIED, FACTS, bars, effort, terms
+from fb3d_rl.report.gallery import films, gallery
+from fb3d_rl.report.page import Block, Cards, Cell, Facts, Figure, Heading, Note, Row, Section, Shown, Source, Table
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.rows import policies as policies_in
 
@@ -38,36 +38,35 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     name = run_dir.resolve().name
     policies = list(dict.fromkeys([*tables.policies_of(numbers), *policies_in(run.rows)]))
     colors = {policy: page.color(i) for i, policy in enumerate(policies)}
-    body = (
-        f"<header><h1>{text(name)}</h1>{page.facts(_facts(numbers), COPIED)}</header>"
-        + page.section("Results", _headline(numbers))
-        + page.section("Geometry left out while reading", _lost(numbers))
-        + page.section("Success by category", _success_bars(numbers))
-        + page.section("How trials ended", _ends(run.rows, policies, numbers.get("policy")))
-        + page.section("What it took", effort(numbers, colors))
-        + page.section("Trials", _trials(run, colors))
-        + page.section("True and predicted flow", clouds.viewer(run.clouds))
-        + page.section("Numbers by category", _category_table(numbers), _split_table(numbers))
-        + page.section("Learning curve", curves.learning_curve(run.log))
-        + page.section("Training", curves.training([("", "", run.log)], curves.once_a_round(run.log)))
-        + page.section("Configuration", f'<pre class="panel">{text(run.config)}</pre>' if run.config else "")
-    )
-    return write(out or run_dir / "report.html", f"{name} · fb3d_rl", body)
+    sections = [
+        Section("Results", _headline(numbers)),
+        Section("Geometry left out while reading", _lost(numbers)),
+        Section("Success by category", _success_bars(numbers)),
+        Section("How trials ended", _ends(run.rows, policies, numbers.get("policy"))),
+        Section("What it took", effort(numbers, colors)),
+        Section("Trials", _trials(run, colors)),
+        Section("True and predicted flow", clouds.viewer(run.clouds)),
+        Section("Numbers by category", [*_category_table(numbers), *_split_table(numbers)]),
+        Section("Learning curve", curves.learning_curve(run.log)),
+        Section("Training", curves.training([("", "", run.log)], curves.once_a_round(run.log))),
+        Section("Configuration", [Source(run.config)] if run.config else []),
+    ]
+    header = [Facts(_facts(numbers), COPIED)]
+    return page.write(out or run_dir / "report.html", f"{name} · fb3d_rl", name, header, sections)
 
 
 def _facts(numbers: Mapping[str, Any]) -> list[tuple[str, object]]:
     return [(label, numbers[key]) for key, label in FACTS.items() if numbers.get(key) not in (None, "")]
 
 
-def _lost(numbers: Mapping[str, Any]) -> str:
+def _lost(numbers: Mapping[str, Any]) -> list[Block]:
     lost = numbers.get(LOST_GEOMETRY, {})
-    rows = "".join(
-        f'<tr><td class="text">{text(name)}</td><td class="text">{"<br>".join(map(text, remarks))}</td></tr>'
-        for name, remarks in lost.items()
-    )
-    head = '<tr><th class="text">object</th><th class="text">what it lacks</th></tr>'
-    says = "These objects are used without some of the shapes that their files describe."
-    return f'<p class="soft">{says}</p>{page.table(head, rows, scroll=True)}' if rows else ""
+    if not lost:
+        return []
+    head = [Cell("object", word=True), Cell("what it lacks", word=True)]
+    rows = [Row([Cell(name, word=True), Cell("\n".join(says), word=True)], mean=False) for name, says in lost.items()]
+    note = Note("These objects are used without some of the shapes that their files describe.")
+    return [note, Table([head], [rows], scroll=True)]
 
 
 def _card(metric: Metric, numbers: Mapping[str, Any], prefix: str = "") -> tuple[str, str, list[str]]:
@@ -79,29 +78,29 @@ def _card(metric: Metric, numbers: Mapping[str, Any], prefix: str = "") -> tuple
     return label[0].upper() + label[1:], metric.show(numbers.get(key)), more
 
 
-def _headline(numbers: Mapping[str, Any]) -> str:
-    blocks = []
+def _headline(numbers: Mapping[str, Any]) -> list[Block]:
+    blocks: list[Block] = []
     if tables.has_flow(numbers):
-        blocks.append(f"<h3>Flow · {numbers['flow/n']} held-out clouds</h3>")
-        blocks.append(page.cards(_card(metric, numbers) for metric in FLOW))
+        blocks.append(Heading(f"Flow · {numbers['flow/n']} held-out clouds"))
+        blocks.append(Cards([_card(metric, numbers) for metric in FLOW]))
     for policy in tables.policies_of(numbers):
         prefix = f"{policy}/"
         counts = f"{numbers[prefix + 'n']} trials on {numbers[prefix + 'n_objects']} objects"
         if numbers[prefix + "n_error"]:
             counts += f", {numbers[prefix + 'n_error']} crashed"
-        blocks.append(f"<h3>{text(policy)} · {counts}</h3>")
+        blocks.append(Heading(f"{policy} · {counts}"))
         shown = [SUCCESS, *([HELD] if policy in tables.unmasked(numbers) else []), CONTACT, DISTANCE, MOTION_ONLY]
-        blocks.append(page.cards(_card(m, numbers, prefix) for m in shown))
+        blocks.append(Cards([_card(m, numbers, prefix) for m in shown]))
     if not blocks:
-        return ""
+        return []
     told = tables.trainings(numbers)
-    return "".join(blocks) + f'<p class="soft">{text(told)}</p>' * bool(told) + page.facts(terms([numbers]))
+    return [*blocks, *[Note(told)] * bool(told), Facts(terms([numbers]))]
 
 
-def _success_bars(numbers: Mapping[str, Any]) -> str:
+def _success_bars(numbers: Mapping[str, Any]) -> list[Block]:
     names = tables.policies_of(numbers)
     if not names:
-        return ""
+        return []
     categories = [c for c, values in numbers["by_category"].items() if any(f"{p}/n" in values for p in names)]
     plot = go.Figure()
     for i, policy in enumerate(names):
@@ -118,75 +117,70 @@ def _success_bars(numbers: Mapping[str, Any]) -> str:
         xaxis={"tickformat": ".0%", "range": [0, 1.02], "title": {"text": "success, with 95 % interval"}},
         yaxis={"autorange": "reversed", "automargin": True, "ticksuffix": "  "},
     )
-    return page.figure("success", plot)
+    return [Figure.of("success", plot)]
 
 
-def _groups(numbers: Mapping[str, Any]) -> list[tuple[str, str, tuple[Metric, ...]]]:
-    """(title, key prefix, metrics) of each group of columns."""
+Columns: TypeAlias = tuple[str, str, Sequence[Metric]]
+"""Title, key prefix and metrics of a group of columns."""
+
+
+def _groups(numbers: Mapping[str, Any]) -> list[Columns]:
     trial = (CONTACT, SUCCESS, DISTANCE)
-    groups: list[tuple[str, str, tuple[Metric, ...]]] = [("flow", "", FLOW)] if tables.has_flow(numbers) else []
+    groups: list[Columns] = [("flow", "", FLOW)] if tables.has_flow(numbers) else []
     return groups + [(policy, f"{policy}/", trial) for policy in tables.policies_of(numbers)]
 
 
-def _category_table(numbers: Mapping[str, Any]) -> str:
+def _category_table(numbers: Mapping[str, Any]) -> list[Block]:
     groups = _groups(numbers)
     if not groups:
-        return ""
-    body = "".join(_table_row(name, values, groups) for name, values in numbers["by_category"].items())
-    means = _table_row("class mean", numbers, groups, "_class_mean", mean=True)
-    means += _table_row("instance mean", numbers, groups, mean=True)
-    return _grouped_table("category", groups, body, means)
+        return []
+    rows = [_table_row(name, values, groups) for name, values in numbers["by_category"].items()]
+    means = [
+        _table_row("class mean", numbers, groups, "_class_mean", mean=True),
+        _table_row("instance mean", numbers, groups, mean=True),
+    ]
+    return [_grouped_table("category", groups, rows, means)]
 
 
-def _split_table(numbers: Mapping[str, Any]) -> str:
+def _split_table(numbers: Mapping[str, Any]) -> list[Block]:
     if "by_split" not in numbers:
-        return ""
+        return []
     groups = _groups(numbers)
-    body = "".join(
+    rows = [
         _table_row(f"{name}, {label}", values, groups, suffix, mean=True)
         for name, values in numbers["by_split"].items()
         for label, suffix in (("class mean", "_class_mean"), ("instance mean", ""))
-    )
-    return "<h3>By split</h3>" + _grouped_table("split", groups, body)
+    ]
+    return [Heading("By split"), _grouped_table("split", groups, rows)]
 
 
-def _grouped_table(first: str, groups: Sequence[tuple[str, str, tuple[Metric, ...]]], *bodies: str) -> str:
-    top, below = "", ""
+def _grouped_table(name: str, groups: Sequence[Columns], *bodies: Sequence[Row]) -> Table:
+    top, below = [Cell(name, word=True, rows=2)], []
     policy = 0
     for title, prefix, metrics in groups:
         color = page.color(policy) if prefix else "var(--line)"
         policy += bool(prefix)
-        span = len(metrics) + bool(prefix)
-        top += f'<th class="group first" style="--swatch:{color}" colspan="{span}">{text(title)}</th>'
+        top.append(Cell(title, first=True, color=color, columns=len(metrics) + bool(prefix)))
         labels = ["n"] * bool(prefix) + [metric.label.removeprefix("flow ") for metric in metrics]
-        below += "".join(
-            f"<th{' class=first' if k == 0 else ''}>{text(label).replace(' ', '<br>')}</th>"
-            for k, label in enumerate(labels)
-        )
-    head = f'<tr><th class="text" rowspan="2">{text(first)}</th>{top}</tr><tr>{below}</tr>'
-    return page.table(head, *bodies)
+        below += [Cell(label.replace(" ", "\n"), first=k == 0) for k, label in enumerate(labels)]
+    return Table([top, below], bodies)
 
 
 def _table_row(
-    label: str,
-    values: Mapping[str, Any],
-    groups: Sequence[tuple[str, str, tuple[Metric, ...]]],
-    suffix: str = "",
-    mean: bool = False,
-) -> str:
-    cells = ""
+    label: str, values: Mapping[str, Any], groups: Sequence[Columns], suffix: str = "", mean: bool = False
+) -> Row:
+    cells = [Cell(label, word=True)]
     for _, prefix, metrics in groups:
-        shown = [text(values.get(f"{prefix}n", 0))] if prefix else []
+        shown = [(str(values.get(f"{prefix}n", 0)), "")] if prefix else []
         for metric in metrics:
             key = prefix + metric.key + suffix
-            interval = metric.show_interval(values.get(f"{key}_ci95"))
-            small = f"<small>{interval}</small>" if mean else ""
-            shown.append(metric.show(values.get(key)) + small)
-        cells += "".join(f"<td{' class=first' if k == 0 else ''}>{cell}</td>" for k, cell in enumerate(shown))
-    return f'<tr{" class=mean" if mean else ""}><td class="text">{text(label)}</td>{cells}</tr>'
+            interval = metric.show_interval(values.get(f"{key}_ci95")) if mean else ""
+            shown.append((metric.show(values.get(key)), interval))
+        cells += [Cell(value, small, first=k == 0) for k, (value, small) in enumerate(shown)]
+    return Row(cells, mean)
 
 
-def _ends(rows: Sequence[TrialRow], policies: Sequence[str], own: object) -> str:
+def _ends(rows: Sequence[TrialRow], policies: Sequence[str], own: object) -> list[Block]:
     """How the trials of each policy ended, and those of the run's own policy in categories where some failed."""
     by_policy = {policy: [row for row in rows if row.policy == policy] for policy in policies}
     blocks = failure_charts.blocks({policy: found for policy, found in by_policy.items() if found})
@@ -194,12 +188,12 @@ def _ends(rows: Sequence[TrialRow], policies: Sequence[str], own: object) -> str
     names = sorted({row.category for row in mine if not row.success})
     if names:
         by_category = {name: [row for row in mine if row.category == name] for name in names}
-        title = f"{text(own)}, categories with failures"
-        blocks += f"<h3>{title}</h3>{failure_charts.bars('ends-by-category', by_category)}"
+        blocks.append(Heading(f"{own}, categories with failures"))
+        blocks += failure_charts.bars("ends-by-category", by_category)
     return blocks
 
 
-def _trials(run: Run, colors: Mapping[str, str]) -> str:
+def _trials(run: Run, colors: Mapping[str, str]) -> list[Block]:
     filmed = films(run)
     place = list(colors).index
     rows = sorted(run.rows, key=lambda row: (row.trial, place(row.policy)))

@@ -1,1 +1,1 @@
-"""From trials to rows: one row per scheduled trial, whatever happens in it."""
+"""From trials to rows: one row per scheduled trial, also for one that crashes."""

@@ -1,4 +1,4 @@
-"""How long a policy takes for a decision, and an end to one that takes too long."""
+"""Measure and limit the time that a policy takes for a decision."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DECISION = "decision_seconds"
 """Where :class:`TimedPolicy` writes how long it took: [E, 1] float32, s of wall time, so it differs between runs."""
 
 GRACE = 10.0
-"""Seconds after the limit at which a worker process is ended that does not come back to Python."""
+"""Seconds after the limit at which a worker process that does not return to Python is ended."""
 
 
 class TookTooLong(Exception):
@@ -30,11 +30,11 @@ class TimedPolicy(TensorDictModuleBase):
     """A policy whose decisions are timed.
 
     A decision that takes longer than the limit ends in :class:`TookTooLong`. One that hangs in a library, where no
-    exception can reach it, ends its worker process; with collector=direct there is none, and nothing ends it.
+    exception can be raised, ends its worker process; with collector=direct there is no such process, and it hangs on.
 
     Args:
         policy: the policy.
-        limit: seconds, or None for as long as it takes.
+        limit: seconds; None for no limit.
     """
 
     def __init__(self, policy: TensorDictModuleBase, limit: float | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Record what the expert does, and run recorded actions again: an episode repeats bit for bit."""
+"""Record the expert's episodes, and run recorded actions again: an episode repeats bit for bit."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ KEYS: tuple[Key, ...] = (
 """What a row of a demonstration holds."""
 
 OUTCOME: tuple[Key, ...] = (("next", "success"), ("next", "normalized_distance"))
-"""What :func:`episode_info` is made of, besides."""
+"""Further entries of the frames, which :func:`episode_info` reads."""
 
 COMMIT_EVERY = 10
-"""Episodes after which they are made to last; a killed process loses fewer than that."""
+"""Episodes are committed to disk in groups of this many; a killed process loses fewer than that."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Assets:
         root: folder of PartNet-Mobility objects; procedural ones are made unless given.
         split: which of them, see :func:`fb3d_rl.assets.splits.select_ids`.
         categories: of procedural objects.
-        count: procedural objects of each category: those that training makes with the same seed.
+        count: procedural objects of each category; they are those of a training with the same seed.
         seed: of the procedural objects.
     """
 
@@ -76,25 +76,25 @@ class Assets:
 def plan(
     objects: Sequence[tuple[ArticulatedObject, str]], options: SampleOptions, seed: int, trials: int | None
 ) -> list[Scheduled]:
-    """List the trials to record: one for every part that opens, or ``trials`` in all, with as many seeds as it takes.
+    """List the trials to record: one for every part that opens, or ``trials`` in all, from as many seeds as that needs.
 
     Raises:
-        UserError: the objects have nothing to open that can be seen.
+        UserError: the objects have no part that opens and can be seen.
     """
-    found: list[Scheduled] = []
-    while trials is None or len(found) < trials:
-        more, _ = schedule(objects, options, seed, None if trials is None else trials - len(found))
-        found += more
+    planned: list[Scheduled] = []
+    while trials is None or len(planned) < trials:
+        more, _ = schedule(objects, options, seed, None if trials is None else trials - len(planned))
+        planned += more
         seed += 1
         if not more:
             raise UserError("the objects have no part that opens and can be seen; choose other objects")
         if trials is None:
             break
-    return found
+    return planned
 
 
 def episode_info(trial: Trial, category: str, frames: TensorDictBase, round: int = 0) -> EpisodeInfo:
-    """What the buffer's table says about an episode of frames [T], which hold :data:`OUTCOME`."""
+    """The entry of the buffer's table for an episode of frames [T], which hold :data:`OUTCOME`."""
     after = frames["next"][-1]
     return EpisodeInfo(
         trial.object, category, trial.link, trial.start, trial.view, trial.seed, round,
@@ -103,13 +103,13 @@ def episode_info(trial: Trial, category: str, frames: TensorDictBase, round: int
 
 
 def trial_of(info: EpisodeInfo) -> Trial:
-    """The trial that an episode was.
+    """The trial of an episode.
 
     Raises:
-        UserError: it is not known, since the data are from elsewhere.
+        UserError: it is unknown, since the data are from another source.
     """
     if not info.start:
-        raise UserError("the episode cannot be run again: the data are from elsewhere, and do not tell its object")
+        raise UserError("the episode cannot be run again: the data are from another source and do not name its object")
     return Trial(info.object, info.link, info.start, info.view, info.seed)
 
 
@@ -122,9 +122,9 @@ def record_expert(
     successful: bool = False,
     progress: Callable[[Episode, bool], None] = lambda episode, kept: None,
 ) -> None:
-    """Add the expert's episodes to ``buffer`` in the order of ``scheduled``, whichever worker is first.
+    """Add the expert's episodes to ``buffer`` in the order of ``scheduled``, on any number of workers.
 
-    What is done when the loop is left, by Ctrl-C too, is committed. A trial that crashes is left out.
+    Finished episodes are committed also when Ctrl-C ends the loop. A trial that crashes is left out.
 
     Args:
         buffer: has room for ``options.horizon`` rows of each trial.
@@ -158,7 +158,7 @@ def record_expert(
 
 
 def recipe(options: EnvOptions, assets: Assets) -> dict[str, Any]:
-    """What a buffer keeps in ``about`` so that its episodes can be run again, here and by ManiSkill's own tools."""
+    """What a buffer stores in ``about`` so that its episodes can be run again, here and by ManiSkill's own tools."""
     from fb3d_rl.env.task import TASK
 
     env_info = {
@@ -173,7 +173,7 @@ def recorded_options(buffer: DemonstrationBuffer) -> EnvOptions:
     """The task's constants that a buffer was recorded with.
 
     Raises:
-        UserError: they are not known, or are another version's.
+        UserError: they are unknown, or from another version.
     """
     try:
         env: dict[str, Any] = dict(buffer.about["env"])
@@ -184,14 +184,14 @@ def recorded_options(buffer: DemonstrationBuffer) -> EnvOptions:
             views=ViewRange(**views), **env,
         )  # fmt: skip
     except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{buffer.path} does not tell how it was recorded, so it cannot be run again") from error
+        raise UserError(f"{buffer.path} does not say how it was recorded, so it cannot be run again") from error
 
 
 def recorded_object(buffer: DemonstrationBuffer, episode: int, root: str | None = None) -> ArticulatedObject:
-    """The object of an episode: from below ``root`` if given, else from where it was when it was recorded.
+    """The object of an episode: from below ``root`` if given, else from where it was recorded from.
 
     Raises:
-        UserError: it is not there, or not known where it was.
+        UserError: it is not there, or it is unknown where it was.
     """
     name = buffer.episodes[episode].object
     try:
@@ -199,7 +199,9 @@ def recorded_object(buffer: DemonstrationBuffer, episode: int, root: str | None 
         assets = Assets(**{**known, "categories": tuple(known["categories"])})
     except (KeyError, TypeError) as error:
         if root is None:
-            raise UserError(f"{buffer.path} does not tell where its objects are; say so with --root DIR") from error
+            raise UserError(
+                f"{buffer.path} does not say where its objects are; give their folder: --root DIR"
+            ) from error
         assets = Assets()
     if root is not None or assets.root is not None:
         assets = replace(assets, root=root or assets.root, split=name)
@@ -210,7 +212,7 @@ def recorded_object(buffer: DemonstrationBuffer, episode: int, root: str | None 
 
 
 class Replay(TensorDictModuleBase):
-    """The policy that takes given actions, whatever it sees.
+    """The policy that takes given actions without regard to what it observes.
 
     Args:
         actions: [T, 8], one for each control step; the last one also for any further step.
@@ -232,10 +234,10 @@ def replay(buffer: DemonstrationBuffer, episode: int, obj: ArticulatedObject) ->
     """Run an episode's recorded actions again, from its start.
 
     Returns:
-        The film, and whether what was seen and where the gripper was is as recorded, bit for bit.
+        The film, and whether the observed points and the tip's positions equal the recorded ones bit for bit.
 
     Raises:
-        UserError: the trial or the task's constants are not known.
+        UserError: the trial or the task's constants are unknown.
     """
     info, frames = buffer.episodes[episode], buffer.frames(episode)
     options = replace(recorded_options(buffer), horizon=info.rows)

@@ -1,4 +1,4 @@
-"""Run one trial again and keep what it takes to draw it: episodes repeat bit for bit, so this is the same episode."""
+"""Run one trial again and record what is needed to draw it; episodes repeat bit for bit, so it is the same episode."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.views import View
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.rollout.collectors import steady_floats
 from fb3d_rl.rollout.run import policy_env, state_of
+from fb3d_rl.rollout.worker import steady_floats
 
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
@@ -31,7 +31,7 @@ class Film:
         policy: name of the policy.
         obj: the object.
         link: index of the link to open.
-        view: where the policy's camera stands.
+        view: position of the policy's camera.
         gripper: meshes of hand, left and right finger, each in its own frame.
         poses: T_world_body [T + 1, L + 3, 4, 4] of the object's links, then of hand, left and right finger.
         tips: where the suction tip is [T + 1, 3], m.
@@ -82,11 +82,11 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
     env, task = policy_env(base, state_of(policy)), cast("OpenArticulatedEnv", base.env)
     poses, frames = [], []
     try:
-        # As a worker runs it, or the episode may end otherwise than its row says.
+        # As in a worker, or the episode may end differently from its row.
         with steady_floats(), set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
             frame, done = env.reset(), False
             while True:
-                # After the last step the policy is asked once more, for what it predicts there.
+                # The policy runs once more after the last step, for its prediction there.
                 frame = policy(frame)
                 poses.append(task.stages[0].poses())
                 frames.append(frame[0].clone())
@@ -95,7 +95,7 @@ def record(name: str, policy: TensorDictModuleBase, obj: ArticulatedObject, tria
                 frame = env.step(frame)
                 done = bool(frame["next", "done"])
                 frame = step_mdp(frame)
-        gripper = task.stages[0].model.gripper
+        gripper = task.stages[0].model.bodies
     finally:
         env.close(raise_if_closed=False)
     predicted = ("prediction", "flow") in frames[0].keys(include_nested=True)

@@ -1,4 +1,4 @@
-"""The two tables that an evaluation leaves behind: a row per scheduled trial, a row per held-out flow sample.
+"""The two tables that an evaluation writes: a row per scheduled trial, a row per held-out flow sample.
 
 Columns keep the order of the fields and floats are written with ``repr``, so reading gives equal rows back.
 """
@@ -38,7 +38,7 @@ TOO_SLOW = "took too long"
 
 @dataclass(frozen=True)
 class TrialRow:
-    """One scheduled trial. What is left at its default describes a trial in which nothing was achieved.
+    """One scheduled trial. The defaults describe a trial in which nothing was achieved.
 
     Attributes:
         trial: index in the schedule, shared by all policies.
@@ -51,7 +51,7 @@ class TrialRow:
         joint_type: "revolute", "continuous" or "prismatic".
         seed: of this trial.
         status: "error" for a trial that crashed.
-        error: what it crashed with.
+        error: the exception or death that ended it; "" if it did not crash.
         steps: control steps taken.
         contact: suction held the target part.
         success: normalized distance below 0.1 at the end.
@@ -60,7 +60,7 @@ class TrialRow:
         failure: why the part was not opened, one of this module's constants; "" on success.
         repeat: which of the repetitions of a protocol that has several.
         seconds: simulated time until success, else until the end, s; -1 if it was not recorded.
-        path_length: way of the suction tip, m; -1 if it was not recorded.
+        path_length: length of the suction tip's path, m; -1 if it was not recorded.
         lost: how often the part was held and then was not; -1 if it was not recorded.
         key: what the trial is (:func:`fb3d_rl.rollout.trials.trial_key`); "" if it was not recorded.
         policy_digest: what the policy is (:func:`fb3d_rl.policies.digest.policy_digest`); "" if it was not recorded.
@@ -161,12 +161,12 @@ def _read(path: Path, kind: type[Row]) -> list[Row]:
     try:
         with path.open(newline="", encoding="utf-8", errors="surrogateescape") as file:
             reader = csv.reader(file)
-            found = next(reader, [])
-            # Files of earlier versions lack what came later, which has a default.
-            if found != [name for name in columns if name in found] or not set(needed) <= set(found):
+            header = next(reader, [])
+            # Files of earlier versions lack newer columns, which have defaults.
+            if header != [name for name in columns if name in header] or not set(needed) <= set(header):
                 raise UserError(f"{path} is of another version: its columns must be {', '.join(columns)}.")
             for values in reader:
-                pairs = zip(found, values, strict=True)
+                pairs = zip(header, values, strict=True)
                 rows.append(kind(**{name: _parse(value, columns[name]) for name, value in pairs}))
     except (OSError, ValueError, KeyError, csv.Error) as error:
         raise UserError(f"Cannot read {path}, row {len(rows) + 1}: {error}") from error
@@ -210,8 +210,8 @@ def read_flow(path: Path) -> list[FlowRow]:
 
 
 def film_name(row: TrialRow) -> str:
-    """Name of the files that hold the film of a trial, without their suffixes."""
-    # Names in strangers' files may hold any character.
+    """Name of the files of a trial's film, without their suffixes."""
+    # The names come from files of other people and may hold any character.
     return re.sub(r"[^\w.-]", "_", f"{row.trial:03d}_{row.object}_{row.link}_{row.policy}", flags=re.ASCII)
 
 

@@ -18,8 +18,9 @@ from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.policies.flow_policy import MASK, FlowPolicy
+from fb3d_rl.policies.flow_policy import MASK
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.policy import initial_state
 from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers
 from fb3d_rl.rollout.decisions import DECISION, TimedPolicy, TookTooLong
 from fb3d_rl.rollout.rows import (
@@ -46,40 +47,29 @@ KEYS: tuple[Key, ...] = (
     ("next", "observation", "attached"),
     ("next", "observation", "contact_force"),
 )
-"""What a row is made of."""
+"""The entries of the frames that a row is computed from."""
 
 
-def state_of(policy: TensorDictModuleBase | None = None) -> TensorDict:
-    """What travels in the TensorDicts [1] of an episode at its start, all 0.
-
-    That is the flow policy's state below "policy", and what else ``policy.initial_state`` lays out.
-    """
-    one = torch.Size([1])
-    start = TensorDict({"policy": FlowPolicy.initial_state(one)}, batch_size=one)
-    further = None if isinstance(policy, FlowPolicy) else getattr(policy, "initial_state", None)
-    return start if further is None else start.update(further(one))
+def state_of(policy: TensorDictModuleBase) -> TensorDict:
+    """The policy's state in the TensorDicts [1] of an episode at its start, all zeros."""
+    return initial_state(policy, torch.Size([1]))
 
 
 def limits_of(options: EnvOptions) -> VelocityLimits:
-    """What an action means to the gripper of a task."""
+    """The velocities that an action of 1 stands for in a task."""
     return VelocityLimits(options.gripper.v_max, options.gripper.w_max, 1.0 / options.control_freq)
 
 
-def policy_env(env: EnvBase, state: TensorDictBase | None = None) -> EnvBase:
-    """``env`` with a policy's state in its TensorDicts, set to 0 at every reset.
-
-    Args:
-        env: the environment.
-        state: as :func:`state_of` gives it; the flow policy's alone unless given.
-    """
-    start = (state_of() if state is None else state).expand(env.batch_size)
-    return _PolicyEnv(env, TensorDictPrimer(_specs_of(start), default_value=0.0))
+def policy_env(env: EnvBase, state: TensorDictBase) -> EnvBase:
+    """``env`` with a policy's state, as :func:`state_of` gives it, in its TensorDicts, set to 0 at every reset."""
+    start = _specs_of(state.expand(env.batch_size))
+    return _PolicyEnv(env, TensorDictPrimer(start, default_value=0.0))
 
 
 class _PolicyEnv(TransformedEnv):
-    """Takes the groups of state that a policy wrote below "next", each of them whole, in place of the last step's.
+    """Replaces groups of state as a whole by those that a policy wrote below "next".
 
-    TorchRL would ask of each of their keys, twice in a step, whether it is among all the keys of the environment.
+    TorchRL would look up each of their keys among all keys of the environment twice in a step, which is slow.
     """
 
     def step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -114,7 +104,7 @@ def run_trials(
     """Run every trial once.
 
     A trial that crashes, or whose policy takes too long, becomes a row with status "error" and counts as a failure;
-    the others are not touched by it. The rows do not depend on the backend and the number of workers.
+    it does not affect the others. The rows do not depend on the backend and the number of workers.
 
     Args:
         name: the policy's name in the rows.
@@ -176,7 +166,7 @@ def _row(episode: Episode, name: str, mask: str, item: Scheduled, options: EnvOp
 
 
 def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
-    """What a row says about the steps [T] of an episode."""
+    """The columns of a row that follow from the steps [T] of an episode."""
     after = frames["next"]
     attached = after["observation", "attached"].flatten()
     held = after["contact"].flatten().nonzero().flatten()

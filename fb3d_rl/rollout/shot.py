@@ -9,8 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.camera.views import View, look_at
-from fb3d_rl.drawing.shade import GRIPPER, Body, Camera, Color, Part, Placed, Studio, link_colors
+from fb3d_rl.drawing.bodies import GRIPPER, Body, Color, Part, Placed, link_colors
+from fb3d_rl.drawing.camera import Camera
 from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
+from fb3d_rl.drawing.studio import Studio
 from fb3d_rl.geometry.points import farthest_point_sample
 from fb3d_rl.kinematics.opening import standing_bounds
 from fb3d_rl.rollout.film import Film
@@ -21,17 +23,17 @@ ARROWS = 26
 VIEWS = tuple(
     View(azimuth, elevation) for elevation in (22.0, 34.0) for azimuth in (-35.0, 35.0, -20.0, 20.0, -55.0, 55.0)
 )
-"""Directions that a film may be drawn from, beside the one of the policy's camera."""
+"""Directions that a film may be drawn from, in addition to that of the policy's camera."""
 
 
 class Shot:
-    """A film's bodies before a camera that sees all of what happens.
+    """A film's bodies, and a camera that has all of them in its picture.
 
     Args:
         film: the film.
         width: of the pictures, pixels.
-        height: of the pictures, pixels; between 0.8 and 1.3 times the width, as the scene calls for, unless given.
-        view: direction to look from; the one that shows the part's motion best unless given.
+        height: of the pictures, pixels; unless given, 0.8 to 1.3 times the width, depending on the scene.
+        view: direction of the camera; the one that shows the part's motion best unless given.
     """
 
     def __init__(self, film: Film, width: int, height: int | None = None, view: View | None = None) -> None:
@@ -100,7 +102,7 @@ class Shot:
                     hidden |= body.blocks(film.poses[t, leader], points + 0.02 * rays, rays, np.inf)
                 across = np.linalg.norm(np.cross(flows, outward), axis=-1)
                 shown = float(~hidden[0]) + (across * ~hidden[1:]).sum() / max(len(flows), 1)
-                # The root prefers a view that always shows something to one that shows much at times.
+                # The square root favours views that show something at all moments over those that show much at a few.
                 scores[number] += np.sqrt(shown)
         return views[int(scores.argmax())]
 
@@ -114,7 +116,7 @@ class Shot:
         nearest = np.linalg.norm(starts[:, None] - points, axis=-1)
         chosen = nearest.argsort(axis=1, kind="stable")[:, :3]
         flows = flow[chosen].mean(1).astype(np.float64)
-        # Arrows stand where the camera of the policy sees the part.
+        # Arrows are drawn only where the policy's camera sees the part.
         seen = (nearest.min(1) < 0.08) & (np.linalg.norm(flows, axis=-1) > 0.12)
         return starts[seen], flows[seen]
 
@@ -159,22 +161,22 @@ def _anchors(film: Film) -> NDArray[np.float64]:
 
 
 def moments(film: Film) -> list[tuple[str, int]]:
-    """Up to six moments that tell the film's story, in order, each with its name."""
+    """Up to six important moments of a film, in order, each with its name."""
     last = len(film) - 1
     if film.attached.any():
         contact = int(film.attached.argmax())
         far = np.linalg.norm(film.tips[:contact] - film.tips[contact], axis=-1) > 0.1
         before = int(np.flatnonzero(far)[-1]) if far.any() else 0
         gain = film.opened[last] - film.opened[contact]
-        found = [("start", 0), ("pre-contact", before), ("contact", contact)]
+        chosen = [("start", 0), ("pre-contact", before), ("contact", contact)]
         for name, share in (("one third", 1 / 3), ("two thirds", 2 / 3)):
             if gain > 0.3:
                 reached = film.opened[contact:] - film.opened[contact] >= share * gain
-                found.append((name, contact + int(reached.argmax())))
+                chosen.append((name, contact + int(reached.argmax())))
             else:
                 t = contact + round(share * (last - contact))
-                found.append((f"step {t}", t))
+                chosen.append((f"step {t}", t))
     else:
-        found = [("start", 0)] + [(f"step {t}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
+        chosen = [("start", 0)] + [(f"step {t}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
     end = ("opened" if film.success else "end", last)
-    return [item for item, after in zip(found, [*found[1:], end], strict=True) if item[1] < after[1]] + [end]
+    return [item for item, after in zip(chosen, [*chosen[1:], end], strict=True) if item[1] < after[1]] + [end]

@@ -7,17 +7,18 @@ import itertools
 import json
 import zlib
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
-from typing import Literal
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.cache import content_digest
-from fb3d_rl.data.samples import ObjectView, SampleOptions
-from fb3d_rl.env.options import Start, Trial, default_trial, drawn_fraction
+from fb3d_rl.data.samples import SampleOptions
+from fb3d_rl.env.options import Trial, default_trial
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.cloud import MIN_VISIBLE
+from fb3d_rl.rollout.options import ScheduleOptions
+from fb3d_rl.scene.observer import find_view
+from fb3d_rl.scene.posed import Posed
 
 
 @dataclass(frozen=True)
@@ -45,32 +46,6 @@ def trial_key(obj: ArticulatedObject, trial: Trial, hold: str) -> str:
     return hashlib.sha256(json.dumps(whole).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class ScheduleOptions:
-    """How trials start, what their goal is, and how often each is repeated.
-
-    Attributes:
-        start: how far the part is open at the start: "reference" (20 % in some categories, else closed), "closed",
-            "random" (uniform, up to 90 %).
-        goal: "open", fully (UMPNet's exploration), or "state", a joint state that is drawn at least 30 % of the range
-            away from the start, which is random then, towards opening or closing (UMPNet's manipulation).
-        repeats: trials of each part, each with a view and a seed of its own.
-    """
-
-    start: Start = "reference"
-    goal: Literal["open", "state"] = "open"
-    repeats: int = 1
-
-    def draw(self, rng: np.random.Generator) -> dict[str, float | None]:
-        """Start and goal of a trial, for :func:`~fb3d_rl.env.options.default_trial`."""
-        if self.goal == "state":
-            start, goal = rng.random(2)
-            while abs(goal - start) < 0.3:
-                start, goal = rng.random(2)
-            return {"fraction": float(start), "goal": float(goal)}
-        return {"fraction": drawn_fraction(self.start, rng)}
-
-
 def schedule(
     objects: Sequence[tuple[ArticulatedObject, str]],
     options: SampleOptions,
@@ -80,8 +55,8 @@ def schedule(
 ) -> tuple[list[Scheduled], int]:
     """List one trial for every part that opens and can be seen.
 
-    The view of a trial is drawn from ``options.views`` until the part shows at least ``MIN_VISIBLE`` points, eight
-    times at most. A trial depends on (seed, object, link, repetition) alone, not on the other objects.
+    The view of a trial is drawn until the cloud shows the part (:func:`~fb3d_rl.scene.observer.find_view`). A trial
+    depends on (seed, object, link, repetition) alone, not on the other objects.
 
     Args:
         objects: objects with their splits.
@@ -101,9 +76,9 @@ def schedule(
     for obj, split in (objects[i] for i in order):
         if limit is not None and len(found.get(obj.category, ())) >= limit:
             continue
-        view = ObjectView(obj, options.camera)
-        for link, repeat in itertools.product(view.openable, range(how.repeats)):
-            trial = _visible_trial(view, link, options, seed, how, repeat)
+        posed = Posed(obj, options.camera)
+        for link, repeat in itertools.product(posed.openable, range(how.repeats)):
+            trial = _visible_trial(posed, link, options, seed, how, repeat)
             if trial is None:
                 hidden += 1
                 continue
@@ -116,37 +91,30 @@ def schedule(
 
 
 def _visible_trial(
-    view: ObjectView,
+    posed: Posed,
     link: int,
     options: SampleOptions,
     seed: int,
     how: ScheduleOptions = ScheduleOptions(),
     repeat: int = 0,
-    tries: int = 8,
 ) -> Trial | None:
-    rng = np.random.default_rng([seed, 3, zlib.crc32(view.obj.id.encode()), link, *[repeat] * (repeat > 0)])
+    rng = np.random.default_rng([seed, 3, zlib.crc32(posed.obj.id.encode()), link, *[repeat] * (repeat > 0)])
     number = int(rng.integers(2**31))
     drawn = how.draw(rng)
-    carried = view.obj.descendants(link)
-    for _ in range(tries):
-        trial = default_trial(view.obj, link, options.views.sample(rng), number, **drawn)
-        _, links = view.cloud(np.array(trial.start), trial.view, options.points, rng)
-        if np.isin(links, carried).sum() >= MIN_VISIBLE:
-            return trial
-    return None
+    trial = default_trial(posed.obj, link, None, number, **drawn)
+    view, shown = find_view(posed, link, trial.start, options.views, rng, options.points)
+    return replace(trial, view=view) if shown else None
 
 
 BARREN = 100
 """Drawn trials in succession that bring nothing at which collecting them ends: fewer may just be bad luck."""
 
 
-def draw_trials(
-    views: Sequence[ObjectView], options: SampleOptions, rng: np.random.Generator, count: int
-) -> list[Trial]:
+def draw_trials(objects: Sequence[Posed], options: SampleOptions, rng: np.random.Generator, count: int) -> list[Trial]:
     """Draw trials to train on: a category, an object of it and a part of that, each with equal odds, then a view.
 
     Args:
-        views: the objects.
+        objects: the objects.
         options: points of a cloud and views.
         rng: the named generator that draws.
         count: number of trials.
@@ -154,19 +122,19 @@ def draw_trials(
     Raises:
         UserError: no part opens, or the camera sees too little of every one.
     """
-    by_category: dict[str, list[ObjectView]] = {}
-    for view in views:
-        if view.openable:
-            by_category.setdefault(view.obj.category, []).append(view)
+    by_category: dict[str, list[Posed]] = {}
+    for posed in objects:
+        if posed.openable:
+            by_category.setdefault(posed.obj.category, []).append(posed)
     categories = sorted(by_category)
     if not categories:
         raise UserError("the objects have no part that opens; choose other objects")
     trials: list[Trial] = []
     for _ in range(100 * count):
         those = by_category[categories[rng.integers(len(categories))]]
-        view = those[rng.integers(len(those))]
-        link = view.openable[rng.integers(len(view.openable))]
-        trial = _visible_trial(view, link, options, int(rng.integers(2**31)))
+        posed = those[rng.integers(len(those))]
+        link = posed.openable[rng.integers(len(posed.openable))]
+        trial = _visible_trial(posed, link, options, int(rng.integers(2**31)))
         if trial is not None:
             trials.append(trial)
         if len(trials) == count:

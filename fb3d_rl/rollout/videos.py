@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.shade import TARGET
+from fb3d_rl.drawing.bodies import TARGET
 from fb3d_rl.drawing.signs import FAINT, FREE, HOLDING, INK, TRACK, font, hex_color
 from fb3d_rl.drawing.video import encode
 from fb3d_rl.env.options import EnvOptions
@@ -33,7 +33,7 @@ STRIP_WIDTH = 1600
 """Width (pixels) of a filmstrip."""
 
 HOLD = 1.0
-"""How long (s) the last moment of a video stays."""
+"""How long (s) the last picture of a video is shown."""
 
 
 def _title(film: Film) -> str:
@@ -66,7 +66,7 @@ def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -
 
 
 def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View | None = None) -> None:
-    """Write the film in real time, the last moment held; see :func:`fb3d_rl.drawing.video.encode`.
+    """Write the film in real time, the last picture a while longer; see :func:`fb3d_rl.drawing.video.encode`.
 
     Args:
         film: the film.
@@ -100,9 +100,9 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
 
 
 def trials_to_film(rows: Sequence[TrialRow], count: int) -> list[int]:
-    """Numbers of ``count`` trials, spread over the categories: half of them failed, where there are as many.
+    """Numbers of ``count`` trials, spread over the categories; half of them failed, if there are enough.
 
-    What counts is how the run's own policy did; its crashed trials are left out.
+    Success is that of the run's own policy; its crashed trials are left out.
     """
     own = own_policy(rows)
     mine = [row for row in rows if row.policy == own and row.status == "ok"]
@@ -132,14 +132,14 @@ def film_trials(
     """Write a video and a filmstrip of some trials with every policy below ``folder``.
 
     Args:
-        folder: is made if need be.
-        rows: what became of the trials; those that crashed are not filmed.
+        folder: is made if it does not exist.
+        rows: results of the trials; those that crashed are not filmed.
         count: how many trials, see :func:`trials_to_film`.
         policies: name -> policy, as the rows name them.
         objects: the objects that the trials name.
         scheduled: the trials.
         options: the task's constants.
-        progress: called with how many films are done, and of how many.
+        progress: called with the number of films that are done and of all films.
     """
     chosen = set(trials_to_film(rows, count))
     wanted = [row for row in rows if row.trial in chosen and row.status == "ok"]

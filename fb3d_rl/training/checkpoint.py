@@ -18,7 +18,7 @@ FORMAT = "fb3d_rl checkpoint 1"
 
 CONTENT = {"algo": str, "config": dict, "model_kwargs": dict, "state": dict, "step": int, "seed": int,
            "git_revision": str}  # fmt: skip
-"""What a checkpoint holds besides its format."""
+"""Entries of a checkpoint other than its format."""
 
 
 def git_revision() -> str:
@@ -96,13 +96,13 @@ def load_checkpoint(path: Path | str, algo: str | None = None, device: str = "cp
         if isinstance(error, OSError) and error.filename is not None:  # the file cannot be read at all
             raise
         raise UserError(
-            f"{path} is damaged or no checkpoint ({type(error).__name__}): copy it anew or train again."
+            f"{path} is damaged or no checkpoint ({type(error).__name__}): copy it again or train again."
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise UserError(f"{path} is not a checkpoint of this version of fb3d_rl: train again.")
     for key, kind in CONTENT.items():
         if not isinstance(content.get(key), kind):
-            raise UserError(f'{path} is damaged (it lacks "{key}"): copy it anew or train again.')
+            raise UserError(f'{path} is damaged (it lacks "{key}"): copy it again or train again.')
     if algo is not None and content["algo"] != algo:
         raise UserError(f"{path} is a checkpoint of {content['algo']}, not of {algo}: choose another file.")
     return content
@@ -110,15 +110,15 @@ def load_checkpoint(path: Path | str, algo: str | None = None, device: str = "cp
 
 @contextmanager
 def fitting(path: Path | str) -> Iterator[None]:
-    """Put to use in here what the checkpoint at ``path`` holds: where that fails, the file is named.
+    """A context in which the content of the checkpoint at ``path`` is used; an error in it names the file.
 
     Raises:
-        UserError: it does.
+        UserError: the content does not fit.
     """
     try:
         yield
     except (RuntimeError, LookupError, TypeError, ValueError, AttributeError) as error:
         raise UserError(
-            f"{path} holds other weights or entries than are read here ({type(error).__name__}): "
-            "choose another file, copy it anew or train again."
+            f"{path} holds other weights or entries than this run needs ({type(error).__name__}): "
+            "choose another file, copy it again or train again."
         ) from error

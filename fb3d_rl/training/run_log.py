@@ -1,4 +1,4 @@
-"""A run's numbers: metrics.jsonl, one JSON object a line, and whatever logger of TorchRL's is wanted besides."""
+"""A run's numbers: metrics.jsonl, one JSON object a line, and one of TorchRL's loggers if the user wants it."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class RunLog:
         self._logger = logger
 
     def write(self, row: dict[str, Any]) -> None:
-        """Append one row. JSON knows no nan or infinity: they become null."""
+        """Append one row. JSON has no nan or infinity: they become null."""
         plain = {
             key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in row.items()
         }

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Literal, get_args
+
 from fb3d_rl.errors import UserError
 
-SCHEDULES = ("constant", "linear", "exponential", "first")
+Schedule = Literal["constant", "linear", "exponential", "first"]
+SCHEDULES: tuple[str, ...] = get_args(Schedule)
 
 
 def beta(schedule: str, index: int, value: float = 1.0, rounds: int = 10, base: float = 0.5) -> float:
@@ -39,5 +42,5 @@ def beta(schedule: str, index: int, value: float = 1.0, rounds: int = 10, base: 
 
 def _share(option: str, value: float) -> float:
     if not 0.0 <= value <= 1.0:
-        raise UserError(f"{option}={value} of the beta schedule is no share; give a number from 0 to 1")
+        raise UserError(f"{option}={value} of the beta schedule is out of range; give a number from 0 to 1")
     return float(value)

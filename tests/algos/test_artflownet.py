@@ -12,22 +12,16 @@ import pytest
 import torch
 
 from fb3d_rl import contract
-from fb3d_rl.algos import dagger, setup
-from fb3d_rl.algos.artflownet import (
-    BEST,
-    CHECKPOINT,
-    MET,
-    SAMPLES,
-    load_network,
-    run,
-    run_evaluation,
-    training_rows,
-)
-from fb3d_rl.config import TRAINED, UNTRAINED
+from fb3d_rl.algos import setup
+from fb3d_rl.algos.flow_network import MET, SAMPLES, training_rows
+from fb3d_rl.algos.run import run_evaluation
+from fb3d_rl.algos.run import run_training as run
+from fb3d_rl.algos.weights import BEST, CHECKPOINT, load_network
 from fb3d_rl.data.generate import load_samples
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.registry import REGISTRY, trained
 from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
 from fb3d_rl.training.run_log import read_rows
 
@@ -156,9 +150,8 @@ def test_a_device_that_is_not_there_is_refused_by_every_command(
     tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    commands = [(dagger.run if name in dagger.ALGOS else run, "train", f"algo={name}") for name in TRAINED]
-    commands += [(run_evaluation, "evaluate", f"policy={name}") for name in (*UNTRAINED, "artflownet")]
-    commands += [(dagger.run_evaluation, "evaluate", f"policy={name}") for name in dagger.ALGOS]
+    commands = [(run, "train", f"algo={name}") for name in trained()]
+    commands += [(run_evaluation, "evaluate", f"policy={name}") for name in REGISTRY]
     for command, name, choice in commands:
         given = ["checkpoint=nowhere.pt"] if name == "evaluate" else []
         with pytest.raises(UserError, match="device=cuda, but torch finds no CUDA device"):

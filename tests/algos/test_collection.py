@@ -17,12 +17,13 @@ from fb3d_rl.algos.collection import RowsOptions, collect
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import F32, GROUPS
-from fb3d_rl.data.samples import ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import Trial
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.rollout.collectors import Episode, Workers
 from fb3d_rl.rollout.trials import BARREN
+from fb3d_rl.scene.posed import Posed
 
 SAMPLES = SampleOptions(points=64, camera=CameraOptions(resolution=24))
 STEPS = 6
@@ -61,7 +62,7 @@ class Fake:
 
 @pytest.fixture
 def collected(procedural_objects: dict[str, ArticulatedObject], monkeypatch: pytest.MonkeyPatch) -> Any:
-    view = ObjectView(procedural_objects["Microwave"], SAMPLES.camera)
+    view = Posed(procedural_objects["Microwave"], SAMPLES.camera)
 
     def drawn(views: object, options: object, rng: object, count: int) -> list[Any]:
         return [SimpleNamespace(object=view.obj.id, link=1, start=(0.0,), view=None, seed=0)] * count

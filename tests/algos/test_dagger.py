@@ -18,7 +18,9 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.algos import collection
-from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, run, run_evaluation, share
+from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, share
+from fb3d_rl.algos.run import run_evaluation
+from fb3d_rl.algos.run import run_training as run
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits

@@ -12,24 +12,33 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.algos.artflownet import load_trained, run, run_evaluation
-from fb3d_rl.algos.kinds import KINDS
+from fb3d_rl.algos.flow_network import FlowNetwork
+from fb3d_rl.algos.run import run_evaluation
+from fb3d_rl.algos.run import run_training as run
 from fb3d_rl.algos.screwnet import screw_loss, screw_objective
 from fb3d_rl.algos.ump_di import direction_cosine
+from fb3d_rl.algos.weights import load_trained
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.kinematics.joint_screw import screw_of_flow
+from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.registry import REGISTRY, behind
 from fb3d_rl.rollout.rows import read_trials
-from fb3d_rl.training.fit import FitOptions, fit
+from fb3d_rl.scene.posed import Posed
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.options import FitOptions
 from fb3d_rl.training.run_log import RunLog, read_rows
 
 Config = Callable[[str, list[str]], Any]
+KINDS: dict[str, FlowNetwork] = {
+    name: behind(entry.algorithm) for name, entry in REGISTRY.items() if entry.options == REGISTRY["artflownet"].options
+}
 BASELINES = ["screwnet", "ump_di"]
 GIVEN_CONTACT = {"ump_di"}
 """Policies of networks that may read the true flow, for where to touch."""
@@ -51,7 +60,9 @@ TRAINING = [
     "algo.checkpoint_every=2",
     "data.train_samples=16",
 ]
-OPTIONS = FitOptions(200, batch_size=2, lr=2e-3, schedule="one_cycle", clip_norm=1.0, rotate=False, log_every=1000)
+OPTIONS = FitOptions(
+    steps=200, batch_size=2, lr=2e-3, schedule="one_cycle", clip_norm=1.0, rotate=False, log_every=1000
+)
 
 
 def network(name: str) -> CloudNetwork:
@@ -61,7 +72,7 @@ def network(name: str) -> CloudNetwork:
 @pytest.fixture(scope="module")
 def door(procedural_objects: dict[str, ArticulatedObject]) -> TensorDictBase:
     """One cloud of a microwave, twice."""
-    view = ObjectView(procedural_objects["Microwave"], CameraOptions(resolution=48))
+    view = Posed(procedural_objects["Microwave"], CameraOptions(resolution=48))
     sample = draw_sample(view, SampleOptions(points=256, all_parts_share=0.0), np.random.default_rng(1))
     assert isinstance(sample, TensorDict)
     return sample.expand(2).clone()
@@ -146,7 +157,7 @@ def test_a_run_in_small_is_resumed_and_evaluated_bit_for_bit(name: str, tmp_path
     assert ("flow/cosine" in summary) == KINDS[name].flow and "success_rate" in summary
     metrics = read_rows(first / "metrics.jsonl", times=False)
     assert any("val/cosine" in row for row in metrics)
-    best = load_trained(first / "best.safetensors", name)
+    best = load_trained(first / "best.safetensors", KINDS[name].network)
     assert type(best) is KINDS[name].network
 
     write = RunLog.write
@@ -168,7 +179,7 @@ def test_a_run_in_small_is_resumed_and_evaluated_bit_for_bit(name: str, tmp_path
     run_evaluation(config("evaluate", [*SMALL, f"policy={name}", f"checkpoint={first / 'checkpoint.pt'}"]), evaluated)
     assert (evaluated / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
     with pytest.raises(UserError, match=f"checkpoint of {name}, not of artflownet"):
-        load_trained(first / "checkpoint.pt", "artflownet")
+        load_trained(first / "checkpoint.pt", ArtFlowNet)
 
 
 @pytest.mark.slow
@@ -177,7 +188,7 @@ def test_the_paper_s_variants_of_artflownet_are_evaluated(variant: str, tmp_path
     words = [f"algo=artflownet_{variant}", *SMALL, *TRAINING]
     mask = "target" if variant == "any_mask" else "none"
     assert [row.mask for row in run(config("train", words), tmp_path)] == [mask]
-    net = load_trained(tmp_path / "checkpoint.pt", "artflownet")
+    net = load_trained(tmp_path / "checkpoint.pt", ArtFlowNet)
     assert net.part_mask_input == (variant == "any_mask")
     given = ["policy=artflownet", f"checkpoint={tmp_path / 'checkpoint.pt'}"]
     rows = run_evaluation(config("evaluate", [*SMALL, *given]), tmp_path / "evaluated")

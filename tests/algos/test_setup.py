@@ -11,23 +11,23 @@ from typing import Any
 
 import pytest
 
-from fb3d_rl.algos.artflownet import run_evaluation
+from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.setup import env_options, eval_entries, flow_policy_options, one_object, settled, train_entries
+from fb3d_rl.assets.options import AssetsOptions
 from fb3d_rl.assets.partnet_mobility import read_category
-from fb3d_rl.config import AssetsConfig
 from fb3d_rl.errors import UserError
 
 
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:
     microwaves = [path.name for path in procedural_root.glob("*Microwave*")]
     root, out = str(procedural_root), tmp_path / "run"
-    mixed = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 0, 0.0)
+    mixed = AssetsOptions("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], [], 3, 0, 0.0)
     entries = train_entries(mixed, out, seed=1)
     train, held_out = entries.train, entries.held_out
     assert sorted(e.category for e in train) == ["Laptop"] * 3 + ["Microwave"] * len(microwaves)
     assert held_out and {e.category for e in held_out} == {"KitchenPot"}
 
-    alone = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 0, 0.0)
+    alone = AssetsOptions("partnet_mobility", root, "Microwave", "KitchenPot", None, [], [], 3, 0, 0.0)
     assert [e.id for e in train_entries(alone, tmp_path / "alone", seed=1).train] == sorted(microwaves)
     assert not (tmp_path / "alone").exists()
 
@@ -36,7 +36,7 @@ def test_procedural_objects_beside_real_ones_are_evaluated_as_splits_of_their_ow
     tmp_path: Path, procedural_root: Path
 ) -> None:
     root = str(procedural_root)
-    both = AssetsConfig("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], ["Box"], 2, 1, 0.0)
+    both = AssetsOptions("partnet_mobility", root, "Microwave", "KitchenPot", None, ["Laptop"], ["Box"], 2, 1, 0.0)
     entries = train_entries(both, tmp_path / "train", seed=1)
     train, held_out = entries.train, entries.held_out
     assert {(e.category, e.split) for e in train if e.category != "Microwave"} == {("Laptop", "train_train")}
@@ -52,7 +52,7 @@ def test_procedural_objects_beside_real_ones_are_evaluated_as_splits_of_their_ow
 
 
 def test_unseen_categories_are_evaluated_and_not_trained_on(tmp_path: Path) -> None:
-    assets = AssetsConfig("procedural", None, "all", "train_test", None, ["Laptop"], ["Box", "Bucket"], 2, 1, 0.0)
+    assets = AssetsOptions("procedural", None, "all", "train_test", None, ["Laptop"], ["Box", "Bucket"], 2, 1, 0.0)
     entries = train_entries(assets, tmp_path / "train", seed=1)
     train, held_out = entries.train, entries.held_out
     assert [(e.category, e.split) for e in train] == [("Laptop", "train_train")] * 2
@@ -63,7 +63,7 @@ def test_unseen_categories_are_evaluated_and_not_trained_on(tmp_path: Path) -> N
 def test_validation_objects_are_split_off_the_training_objects(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assets = AssetsConfig("procedural", None, "all", "train_test", None, ["Laptop", "Box"], [], 10, 2, 0.2)
+    assets = AssetsOptions("procedural", None, "all", "train_test", None, ["Laptop", "Box"], [], 10, 2, 0.2)
     entries = train_entries(assets, tmp_path / "a", seed=1)
     assert Counter(e.category for e in entries.validation) == {"Laptop": 2, "Box": 2}
     assert {e.split for e in entries.validation} == {"train_train"}

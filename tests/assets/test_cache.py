@@ -33,13 +33,13 @@ def folder(tmp_path: Path, procedural_root: Path) -> Path:
 def parses(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """The objects that were parsed."""
     parsed: list[Path] = []
-    read = partnet_mobility._Reader.read
+    read = partnet_mobility.PartNetReader.read
 
-    def counted(self: partnet_mobility._Reader) -> object:
+    def counted(self: partnet_mobility.PartNetReader) -> object:
         parsed.append(self.folder)
         return read(self)
 
-    monkeypatch.setattr(partnet_mobility._Reader, "read", counted)
+    monkeypatch.setattr(partnet_mobility.PartNetReader, "read", counted)
     return parsed
 
 
@@ -127,8 +127,8 @@ def test_a_full_disk_costs_the_cache_alone(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setenv("FB3D_CACHE_SAID", "")  # so that it is as before in the end
-    monkeypatch.delenv("FB3D_CACHE_SAID")
+    monkeypatch.setenv("FB3D_CACHE_WARNED", "")  # so that it is as before in the end
+    monkeypatch.delenv("FB3D_CACHE_WARNED")
     with full_disk(1000):
         assert_same(load_object(folder), load_object(folder))
     assert len(parses) == 2

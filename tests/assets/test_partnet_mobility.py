@@ -13,7 +13,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets import partnet_mobility
+from fb3d_rl.assets import partnet_mobility, urdf
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders
 from fb3d_rl.assets.partnet_mobility import load_object, load_objects
@@ -279,7 +279,7 @@ def test_load_objects_skips_and_names_broken_ones(tmp_path: Path) -> None:
 def test_sizes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before a file is read: the limits are far above what real objects have."""
     folder = write(tmp_path / "a17")
-    monkeypatch.setattr(partnet_mobility, "MOST_LINKS", 4)
+    monkeypatch.setattr(urdf, "MOST_LINKS", 4)
     assert "5 links" in refuse(write(folder, GOOD + " "))  # not yet in the cache
     monkeypatch.undo()
     size = (folder / "textured_objs/a.obj").stat().st_size

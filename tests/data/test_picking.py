@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch.utils.data import DataLoader
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
-from fb3d_rl.algos.dagger import Labels
+from fb3d_rl.algos.learners import Labels
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.generate import DONE, Joined, empty_rows, load_samples

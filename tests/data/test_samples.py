@@ -12,19 +12,21 @@ from fb3d_rl import contract
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View, ViewRange
-from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
+from fb3d_rl.scene.observer import MIN_VISIBLE, observe
+from fb3d_rl.scene.posed import Posed
 
 CAMERA = CameraOptions(resolution=32)
 OPTIONS = SampleOptions(points=256, camera=CAMERA)
 
 
 @pytest.fixture(scope="module")
-def views(procedural_objects: dict[str, ArticulatedObject]) -> list[ObjectView]:
-    return [ObjectView(obj, CAMERA) for obj in procedural_objects.values()]
+def views(procedural_objects: dict[str, ArticulatedObject]) -> list[Posed]:
+    return [Posed(obj, CAMERA) for obj in procedural_objects.values()]
 
 
 @pytest.mark.parametrize("all_parts", [0.0, 1.0])
-def test_mask_is_where_the_flow_is(views: list[ObjectView], all_parts: float) -> None:
+def test_mask_is_where_the_flow_is(views: list[Posed], all_parts: float) -> None:
     options = dataclasses.replace(OPTIONS, all_parts_share=all_parts)
     for view in views:
         for seed in range(5):
@@ -44,7 +46,7 @@ def test_mask_is_where_the_flow_is(views: list[ObjectView], all_parts: float) ->
                 assert int(sample["target"]) in view.openable and int(mask.sum()) >= MIN_VISIBLE
 
 
-def test_some_parts_are_a_part_and_others_with_it(views: list[ObjectView]) -> None:
+def test_some_parts_are_a_part_and_others_with_it(views: list[Posed]) -> None:
     view = next(v for v in views if v.obj.category == "StorageFurniture")
     options = dataclasses.replace(OPTIONS, all_parts_share=0.2, some_parts_share=0.5)
     counts, tree = [], view.tree.descendants.numpy()
@@ -63,7 +65,7 @@ def test_some_parts_are_a_part_and_others_with_it(views: list[ObjectView]) -> No
     assert 0.3 < np.mean([more for _, more in counts]) < 0.6 and len(tree) > 2
 
 
-def test_padding_follows_the_points(views: list[ObjectView]) -> None:
+def test_padding_follows_the_points(views: list[Posed]) -> None:
     sample = draw_sample(views[0], dataclasses.replace(OPTIONS, points=2000), np.random.default_rng(0))
     assert sample is not None
     valid = sample["observation", "valid"]
@@ -73,7 +75,7 @@ def test_padding_follows_the_points(views: list[ObjectView]) -> None:
     assert (sample["observation", "points"][valid][:, 2] > -1e-4).all()  # on the ground or above
 
 
-def test_a_sample_follows_from_its_generator_alone(views: list[ObjectView]) -> None:
+def test_a_sample_follows_from_its_generator_alone(views: list[Posed]) -> None:
     first, again = (draw_sample(views[0], OPTIONS, np.random.default_rng([7, 1, 3])) for _ in range(2))
     other = draw_sample(views[0], OPTIONS, np.random.default_rng([7, 1, 4]))
     assert first is not None and again is not None and other is not None
@@ -81,41 +83,41 @@ def test_a_sample_follows_from_its_generator_alone(views: list[ObjectView]) -> N
     assert not torch.equal(first["observation", "points"], other["observation", "points"])
 
 
-def test_direction_points_towards_opening(views: list[ObjectView]) -> None:
+def test_direction_points_towards_opening(views: list[Posed]) -> None:
     for view in views:
         assert view.openable
         for link in view.openable:
             direction = view.direction(link)
             j = view.obj.movable.index(link)
-            assert direction[j] == np.sign(view.open[j] - view.closed[j])
-            assert np.count_nonzero(direction) == 1
-        assert np.count_nonzero(view.direction()) == len(view.obj.movable)
+            assert direction[j] == np.sign(view.opened[j] - view.closed[j])
+            assert torch.count_nonzero(direction) == 1
+        assert torch.count_nonzero(view.direction()) == len(view.obj.movable)
 
 
-def test_flow_leads_from_closed_to_open(views: list[ObjectView]) -> None:
+def test_flow_leads_from_closed_to_open(views: list[Posed]) -> None:
     for view in views:
         link = view.openable[0]
         j = view.obj.movable.index(link)
         qpos = view.closed.copy()
-        qpos[j] += 0.3 * (view.open[j] - view.closed[j])
-        rng = np.random.default_rng(0)
-        points, links = view.cloud(qpos, View(20.0, 35.0), 400, rng)
-        flow = view.flow(points, links, qpos, view.direction(link)).double()
+        qpos[j] += 0.3 * (view.opened[j] - view.closed[j])
+        cloud = observe(view, view.poses(qpos), View(20.0, 35.0), 400, np.random.default_rng(0))
+        points, links = cloud.points, cloud.links
+        flow = cloud.with_truth(view.direction(link))["flow"].double()
         further = qpos.copy()
-        further[j] += 1e-4 * (view.open[j] - view.closed[j])
-        here, there = ((view.base @ view.tree.forward(torch.as_tensor(q)))[links] for q in (qpos, further))
+        further[j] += 1e-4 * (view.opened[j] - view.closed[j])
+        here, there = (torch.from_numpy(view.poses(q)[links]) for q in (qpos, further))
         homogeneous = torch.cat([torch.as_tensor(points).double(), torch.ones(len(points), 1).double()], dim=-1)
         moved = (there @ torch.linalg.inv(here) @ homogeneous[..., None])[:, :3, 0] - homogeneous[:, :3]
         moved = torch.where(torch.as_tensor(links >= 0)[:, None], moved, 0.0)
         torch.testing.assert_close(flow, moved / moved.norm(dim=-1).max(), atol=2e-3, rtol=0)
 
 
-def test_shares_are_kept(views: list[ObjectView]) -> None:
+def test_shares_are_kept(views: list[Posed]) -> None:
     view = next(v for v in views if v.obj.category == "StorageFurniture")
     always = dataclasses.replace(OPTIONS, closed_share=1.0, others_closed=1.0, all_parts_share=0.0, points=512)
     fixed = dataclasses.replace(always, views=ViewRange((0.0, 0.0), (30.0, 30.0)))
-    closed, _ = view.cloud(view.closed, View(0.0, 30.0), 1024, np.random.default_rng(0))
-    everything = {tuple(point) for point in closed.tolist()}
+    closed = observe(view, view.poses(view.closed), View(0.0, 30.0), 1024, np.random.default_rng(0))
+    everything = {tuple(point) for point in closed.points.tolist()}
     sample = draw_sample(view, fixed, np.random.default_rng(1))
     assert sample is not None
     seen = sample["observation", "points"][sample["observation", "valid"]]
@@ -128,7 +130,7 @@ def test_shares_are_kept(views: list[ObjectView]) -> None:
     assert 0.3 < share < 0.7
 
 
-def test_a_part_that_does_not_show_gives_no_sample(views: list[ObjectView]) -> None:
+def test_a_part_that_does_not_show_gives_no_sample(views: list[Posed]) -> None:
     view = next(v for v in views if v.obj.category == "Microwave")
     behind = dataclasses.replace(
         OPTIONS, views=ViewRange((180.0, 180.0), (0.0, 0.0)), closed_share=1.0, others_closed=1.0
@@ -136,7 +138,7 @@ def test_a_part_that_does_not_show_gives_no_sample(views: list[ObjectView]) -> N
     assert draw_sample(view, behind, np.random.default_rng(0)) is None
 
 
-def test_a_joint_written_the_other_way_round_gives_the_same_sample(views: list[ObjectView]) -> None:
+def test_a_joint_written_the_other_way_round_gives_the_same_sample(views: list[Posed]) -> None:
     obj = next(v for v in views if v.obj.category == "StorageFurniture").obj
     links = []
     for link in obj.links:
@@ -144,8 +146,8 @@ def test_a_joint_written_the_other_way_round_gives_the_same_sample(views: list[O
         if joint is not None and joint.movable:
             joint = dataclasses.replace(joint, axis=-joint.axis, limits=(-joint.limits[1], -joint.limits[0]))
         links.append(dataclasses.replace(link, joint=joint))
-    plain, turned = ObjectView(obj, CAMERA), ObjectView(dataclasses.replace(obj, links=tuple(links)), CAMERA)
-    np.testing.assert_array_equal(turned.open, -plain.open)
+    plain, turned = Posed(obj, CAMERA), Posed(dataclasses.replace(obj, links=tuple(links)), CAMERA)
+    np.testing.assert_array_equal(turned.opened, -plain.opened)
     for seed in range(4):
         first, second = (draw_sample(view, OPTIONS, np.random.default_rng(seed)) for view in (plain, turned))
         assert first is not None and second is not None

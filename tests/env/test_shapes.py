@@ -12,8 +12,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
+from fb3d_rl.env.model import PLATE, _hull, _other_sides, _surface
 from fb3d_rl.env.options import EnvOptions, default_trial
-from fb3d_rl.env.stage import PLATE, _hull, _other_sides, _surface
 from fb3d_rl.env.task import OpenArticulatedEnv
 
 from .conftest import velocity

@@ -215,7 +215,9 @@ def test_a_stage_takes_another_trial_with_what_is_built(
     assert placed.links is built.links and placed.static is built.static and placed.order == built.order
     assert obj.movable[placed.target] == door and bool(placed.moved[door]) and not bool(placed.moved[drawer])
     assert placed.direction.tolist() == [placed.sign * (link == door) for link in obj.movable]
-    assert {env._draw_trial(built).object for _ in range(5)} == {obj.id}, "what is drawn for it is of its object"
+    rng = np.random.default_rng(0)
+    kept = [env.source.draw(rng, obj.id, built.trial.view) for _ in range(5)]
+    assert {(trial.object, trial.view) for trial in kept} == {(obj.id, built.trial.view)}, "object and view stay"
     with pytest.raises(UserError, match="trials"):
         env.reset(options={"trials": [default_trial(obj), default_trial(obj)]})
 

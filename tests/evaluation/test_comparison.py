@@ -19,7 +19,8 @@ from scipy.stats import binomtest
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import learning, tables
-from fb3d_rl.evaluation.comparison import COLUMNS, Comparison, Entry, compare
+from fb3d_rl.evaluation.comparison import Comparison, Entry, compare
+from fb3d_rl.evaluation.comparison_tables import COLUMNS
 from fb3d_rl.evaluation.runs import find_runs, read_run
 from fb3d_rl.evaluation.tables import SUCCESS, difference, summary
 from fb3d_rl.report.comparison_page import write_comparison
@@ -446,11 +447,12 @@ class Page(HTMLParser):
 
     def handle_endtag(self, tag: str) -> None:
         assert self.open.pop() == tag
+        self.figure = None
 
     def handle_data(self, data: str) -> None:
         if self.figure:
             self.figures[self.figure] = json.loads(data)
-        elif self.cdata_elem is None:
+        elif self.cdata_elem is None and data.strip():
             self.text.append(data)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fb3d_rl.evaluation.tables import UNIT, limits, wilson
+from fb3d_rl.evaluation.intervals import UNIT, limits, wilson
 
 Array = NDArray[np.float64]
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import re
 from collections import Counter
-from typing import Any
 
 import pytest
 
 from fb3d_rl.evaluation.failures import ENDS, stages
 from fb3d_rl.report.failure_charts import bars, flow_chart
+from fb3d_rl.report.page import Figure
 from fb3d_rl.rollout.rows import TrialRow
 
 
@@ -20,13 +18,6 @@ def trial(failure: str = "", contact: bool = True, status: str = "ok") -> TrialR
         0, "bc", "1", "Box", "test", "link_0", "lid", "revolute", 0,
         status=status, contact=contact, success=success, failure=failure,  # type: ignore[arg-type]
     )  # fmt: skip
-
-
-def figure(block: str) -> dict[str, Any]:
-    found = re.search(r"data-figure=[^>]*>(.*?)</script>", block)
-    assert found is not None
-    content: dict[str, Any] = json.loads(found[1])
-    return content
 
 
 @pytest.mark.parametrize(
@@ -63,7 +54,7 @@ def every_end() -> list[TrialRow]:
 
 def test_the_chart_loses_no_trial_and_names_each_end_once() -> None:
     rows = every_end()
-    chart = figure(flow_chart("chart", rows))["data"][0]
+    chart = flow_chart("chart", rows).content["data"][0]
     labels, link = chart["node"]["label"], chart["link"]
     entered: Counter[int] = Counter()
     left: Counter[int] = Counter()
@@ -81,7 +72,7 @@ def test_the_chart_loses_no_trial_and_names_each_end_once() -> None:
 
 def test_nodes_of_the_chart_lie_apart_and_inside() -> None:
     rows = every_end()
-    found = figure(flow_chart("chart", rows))
+    found = flow_chart("chart", rows).content
     layout, node = found["layout"], found["data"][0]["node"]
     height = layout["height"] - layout["margin"]["t"] - layout["margin"]["b"]
     counts = [int(label.rpartition(" ")[2]) for label in node["label"]]
@@ -99,7 +90,7 @@ def test_nodes_of_the_chart_lie_apart_and_inside() -> None:
 
 def test_bars_are_shares_of_each_groups_trials() -> None:
     groups = {"one": [trial()] * 3 + [trial("lost hold")], "<two>": [trial("stuck")] * 5}
-    plot = figure(bars("bars", groups))
+    (plot,) = (block.content for block in bars("bars", groups) if isinstance(block, Figure))
     shares = {trace["name"]: trace["x"] for trace in plot["data"]}
     assert list(shares) == ["success", "stuck", "lost hold"], "from the best to the worst"
     assert shares == {"success": [0.75, 0.0], "stuck": [0.0, 1.0], "lost hold": [0.25, 0.0]}

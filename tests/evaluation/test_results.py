@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.evaluation.comparison import compare, write_csv
+from fb3d_rl.evaluation.comparison import compare
+from fb3d_rl.evaluation.comparison_tables import write_csv
 from fb3d_rl.evaluation.published import paper
 from fb3d_rl.evaluation.runs import find_runs, read_run
 from fb3d_rl.evaluation.tables import summary

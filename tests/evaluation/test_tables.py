@@ -2,13 +2,16 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from rich.console import Console
 from scipy.stats import binomtest
 
-from fb3d_rl.evaluation.tables import UNIT, means, number_rows, show, summary, trainings, wilson
+from fb3d_rl.evaluation.intervals import UNIT, means, wilson
+from fb3d_rl.evaluation.tables import number_rows, show, summary, trainings
 from fb3d_rl.rollout.rows import FlowRow, TrialRow
 
 
@@ -245,3 +248,9 @@ def test_what_was_opened_without_a_mask_is_counted_beside_success() -> None:
 def test_a_table_of_benchmarks_has_every_number() -> None:
     rows = list(number_rows({"steps": {"a": 1234.5, "b": 0.5123, "objects": ["x"], "c": "not measured"}}))
     assert rows == [("steps", "a", "1234"), ("steps", "b", "0.512"), ("steps", "c", "not measured")]
+
+
+@pytest.mark.parametrize("module", ["fb3d_rl.evaluation.intervals", "fb3d_rl.rollout.rows"])
+def test_rows_and_intervals_load_no_torch(module: str) -> None:
+    code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.kinematics.joint_screw import JointScrew, flow_of_screw, screw_of_flow
+from fb3d_rl.scene.posed import Posed
 
 COUNT = 60
 
@@ -66,7 +67,7 @@ def test_two_parts_that_move_by_different_joints_are_not_explained() -> None:
 def test_the_joints_of_objects_are_found(procedural_objects: dict[str, ArticulatedObject]) -> None:
     kinds = set()
     for obj in procedural_objects.values():
-        view = ObjectView(obj, CameraOptions(resolution=48))
+        view = Posed(obj, CameraOptions(resolution=48))
         for number in range(4):
             options = SampleOptions(points=400, all_parts_share=0.0)
             sample = draw_sample(view, options, np.random.default_rng(number))

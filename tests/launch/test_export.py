@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from fb3d_rl.algos.artflownet import load_network
+from fb3d_rl.algos.weights import load_network
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.training.checkpoint import save_checkpoint
 from launch.export import main

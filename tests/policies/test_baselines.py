@@ -10,7 +10,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from fb3d_rl.algos.artflownet import run_evaluation
+from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.policies.baselines import NormalFlow, RandomPolicy, normal_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.rollout.rows import read_trials

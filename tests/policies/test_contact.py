@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from fb3d_rl.assets.gripper import HAND_LENGTH
-from fb3d_rl.policies.contact import CANDIDATES, ContactOptions, _motions, best_candidate, choose_contact
+from fb3d_rl.policies.contact import CANDIDATES, Contact, ContactOptions, _motions, best_candidate, choose_contact
 
 TOWARDS = torch.tensor([[-1.0, 0.0, 0.0]])
 """Axis of a hand that stands before the plate."""
@@ -22,7 +22,7 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
     nobody = torch.zeros_like(valid)
     camera = torch.tensor([[-3.0, 0.0, 1.0]])
-    return choose_contact(
+    contact = choose_contact(
         points,
         valid,
         flow.norm(dim=-1) > 0,
@@ -32,7 +32,8 @@ def choose(points: torch.Tensor, flow: torch.Tensor, avoid: torch.Tensor | None 
         TOWARDS,
         nobody if avoid is None else avoid,
         ContactOptions(**options),
-    )[:3]
+    )[0]
+    return contact.point, contact.flow, contact.standoff
 
 
 def on(points: torch.Tensor, contact: torch.Tensor) -> bool:
@@ -97,7 +98,7 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
     valid[:, :300] = False
     flow = hinge_flow(points)
     flow[:, :300] *= 100.0
-    contact, *_ = choose_contact(
+    chosen, _ = choose_contact(
         points,
         valid,
         valid,
@@ -108,6 +109,7 @@ def test_no_flow_no_contact_and_padding_is_never_chosen() -> None:
         torch.zeros_like(valid),
         ContactOptions(min_flow=0.0),
     )
+    contact = chosen.point
     assert on(points[:, 300:], contact) and not on(points[:, :300], contact)
 
 
@@ -118,11 +120,11 @@ def test_where_something_stands_before_the_whole_part_the_hand_comes_along_the_l
     flow = torch.cat([hinge_flow(points), torch.zeros(1, cloud.shape[1] - points.shape[1], 3)], dim=1)
     camera = torch.tensor([[-3.0, 0.0, 4.0]])
     valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
-    contact, direction, standoff, _ = choose_contact(
+    chosen, _ = choose_contact(
         cloud, valid, flow.norm(dim=-1) > 0, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
-    assert torch.allclose(direction[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
-    assert torch.allclose(standoff, torch.nn.functional.normalize(camera - contact), atol=1e-4)
+    assert torch.allclose(chosen.flow[0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-5)
+    assert torch.allclose(chosen.standoff, torch.nn.functional.normalize(camera - chosen.point), atol=1e-4)
 
 
 @pytest.mark.parametrize("height", [0.1, 0.2])
@@ -131,9 +133,10 @@ def test_the_hand_does_not_come_from_below_the_ground(height: float) -> None:
     flow = torch.tensor([0.0, 0.0, -1.0]).expand_as(points).clone()
     camera = torch.tensor([[-3.0, 0.0, 0.05]])  # seen from below
     valid = torch.ones(points.shape[:2], dtype=torch.bool)
-    _, _, standoff, _ = choose_contact(
+    chosen, _ = choose_contact(
         points, valid, valid, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
+    standoff = chosen.standoff
     assert standoff[0, 2] > -0.1 and standoff.norm() == pytest.approx(1.0, abs=1e-4)
 
 
@@ -157,44 +160,42 @@ def test_of_points_that_move_alike_the_one_near_the_hand_is_chosen_but_no_near_o
     drawer = TOWARDS.expand_as(points)
     for side in (-1.0, 1.0):
         hand = torch.tensor([[-0.5, side, 0.5]])
-        drawn, *_ = choose_contact(points, valid, valid, drawer, camera, hand, TOWARDS, nobody, ContactOptions())
-        assert side * drawn[0, 1] > 0
+        drawn, _ = choose_contact(points, valid, valid, drawer, camera, hand, TOWARDS, nobody, ContactOptions())
+        assert side * drawn.point[0, 1] > 0
         flow = hinge_flow(points)
         # With the default the way counts for more, down to the least flow that does.
         for near, least in ((1.0, 0.8), (ContactOptions.near, ContactOptions.min_flow)):
             options = ContactOptions(near=near)
-            door, *_ = choose_contact(points, valid, valid, flow, camera, hand, TOWARDS, nobody, options)
-            assert flow[(points == door[:, None]).all(-1)].norm() >= least * flow.norm(dim=-1).amax()
+            door, _ = choose_contact(points, valid, valid, flow, camera, hand, TOWARDS, nobody, options)
+            assert flow[(points == door.point[:, None]).all(-1)].norm() >= least * flow.norm(dim=-1).amax()
 
 
 def test_the_best_candidate_is_good_has_its_flow_and_is_near_to_where_the_hand_is_by_now() -> None:
     points = plate()[:, torch.randperm(625, generator=torch.Generator().manual_seed(0))]
     valid, camera = torch.ones(points.shape[:2], dtype=torch.bool), torch.tensor([[-3.0, 0.0, 1.0]])
     flow = hinge_flow(points)
-    *_, candidates = choose_contact(
+    _, candidates = choose_contact(
         points, valid, valid, flow, camera, camera, TOWARDS, torch.zeros_like(valid), ContactOptions()
     )
-    share = candidates[0, :, 9]
+    share = candidates.share[0, :, 0]
     assert len(share) == CANDIDATES and ((share >= 0.5) | (share == 0)).all() and (share > 0).sum() > 20
     for height in (0.6, 1.0, 1.4):
         hand = torch.tensor([[-0.1, -0.3, height]])
-        point, pull, standoff, share = best_candidate(candidates, hand, TOWARDS, ContactOptions()).split(
-            [3, 3, 3, 1], 1
-        )
-        assert (point - hand).norm() < 0.25
-        here = (points == point[:, None]).all(-1)
-        torch.testing.assert_close(share, flow[here].norm(dim=-1, keepdim=True) / flow.norm(dim=-1).amax())
-        assert torch.allclose(pull, TOWARDS, atol=1e-5) and torch.allclose(standoff, TOWARDS, atol=1e-3)
+        best = best_candidate(candidates, hand, TOWARDS, ContactOptions())
+        assert (best.point - hand).norm() < 0.25
+        here = (points == best.point[:, None]).all(-1)
+        torch.testing.assert_close(best.share, flow[here].norm(dim=-1, keepdim=True) / flow.norm(dim=-1).amax())
+        assert torch.allclose(best.flow, TOWARDS, atol=1e-5) and torch.allclose(best.standoff, TOWARDS, atol=1e-3)
 
 
 def test_the_hand_turns_no_further_than_it_has_to() -> None:
-    candidates = torch.zeros(1, CANDIDATES, 10)
-    candidates[0, :2, 3:6] = candidates[0, 0, 6:9] = TOWARDS
-    candidates[0, 1, 6:9] = torch.tensor([0.0, 1.0, 0.0])  # as near, but to be touched from the side
-    candidates[0, :2, 9] = 1.0
-    candidates[0, 0, 0] = 0.02
+    candidates = Contact.none((1,))
+    candidates.flow[0, :2] = candidates.standoff[0, 0] = TOWARDS
+    candidates.standoff[0, 1] = torch.tensor([0.0, 1.0, 0.0])  # as near, but to be touched from the side
+    candidates.share[0, :2] = 1.0
+    candidates.point[0, 0, 0] = 0.02
     best = best_candidate(candidates, torch.tensor([[-0.3, 0.0, 0.0]]), TOWARDS, ContactOptions())
-    assert torch.equal(best, candidates[:, 0]), "the farther one, and none of the empty rows"
+    assert (best == candidates.at(torch.tensor([0]))).all(), "the farther one, and none of the empty rows"
 
 
 def test_a_hand_that_would_come_from_below_the_ground_takes_another_way() -> None:
@@ -237,7 +238,5 @@ def test_without_a_mask_what_moves_is_chosen_and_what_does_not_is_in_the_way() -
     flow = torch.cat([hinge_flow(points), torch.full((1, len(shelf), 3), 1e-3)], dim=1)
     valid = torch.ones(cloud.shape[:2], dtype=torch.bool)
     camera = torch.tensor([[-3.0, 0.0, 1.0]])
-    contact, *_ = choose_contact(
-        cloud, valid, None, flow, camera, camera, TOWARDS, ~valid, ContactOptions(min_flow=0.1)
-    )
-    assert contact[0, 1] > 0.1 and contact[0, 0] == 0.0
+    chosen, _ = choose_contact(cloud, valid, None, flow, camera, camera, TOWARDS, ~valid, ContactOptions(min_flow=0.1))
+    assert chosen.point[0, 1] > 0.1 and chosen.point[0, 0] == 0.0

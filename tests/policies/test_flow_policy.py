@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -14,18 +13,9 @@ from fb3d_rl.assets.gripper import HAND_LENGTH
 from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
 from fb3d_rl.models.artflownet import ArtFlowNet
-from fb3d_rl.policies.flow_policy import (
-    APPROACH,
-    PULL,
-    RELEASE,
-    RETREAT,
-    SELECT,
-    TRAVEL,
-    FlowPolicy,
-    FlowPolicyOptions,
-    artflownet_policy,
-    expert_policy,
-)
+from fb3d_rl.policies.commands import above_ground
+from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, artflownet_policy, expert_policy
+from fb3d_rl.policies.flow_state import APPROACH, PULL, RELEASE, RETREAT, SELECT, TRAVEL, FlowState
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
@@ -98,8 +88,12 @@ class ToyDoor:
             self.opened = math.atan2(-float(tip[0]), 0.4 - float(tip[1]))
 
 
+def start() -> TensorDict:
+    return FlowState.initial((1,)).packed()
+
+
 def rollout(door: ToyDoor, policy: FlowPolicy, until: float, steps: int = 150) -> list[int]:
-    state, phases = policy.initial_state((1,)), []
+    state, phases = start(), []
     while door.opened < until and len(phases) < steps:
         td = policy(door.observe(state))
         state = td["next", "policy"]
@@ -130,7 +124,7 @@ def test_opens_a_drawer_straight() -> None:
 
 def test_touches_where_the_lever_is_long() -> None:
     policy = expert_policy(LIMITS)
-    td = policy(ToyDoor().observe(policy.initial_state((1,))))
+    td = policy(ToyDoor().observe(start()))
     contact = td["next", "policy", "contact_point"][0]
     assert contact[1] < 0.0, "the hinge is at y = 0.4"
     assert torch.allclose(td["next", "policy", "standoff"][0], torch.tensor([-1.0, 0.0, 0.0]), atol=1e-4)
@@ -139,7 +133,7 @@ def test_touches_where_the_lever_is_long() -> None:
 def test_a_guarded_approach_that_does_not_hold_is_given_up_and_another_point_is_tried() -> None:
     options = FlowPolicyOptions(patience=0.05)
     policy, door = expert_policy(LIMITS, options), ToyDoor()
-    state = policy.initial_state((1,))
+    state = start()
     points, phases = [], []
     for _ in range(120):
         td = door.observe(state)
@@ -157,7 +151,7 @@ def test_a_guarded_approach_that_does_not_hold_is_given_up_and_another_point_is_
 
 def test_without_flow_it_waits() -> None:
     policy = expert_policy(LIMITS)
-    td = ToyDoor().observe(policy.initial_state((1,)))
+    td = ToyDoor().observe(start())
     td["privileged", "flow"] = torch.zeros_like(td["privileged", "flow"])
     out = policy(td)
     assert int(out["next", "policy", "phase"]) == SELECT
@@ -168,7 +162,7 @@ def test_environments_of_a_batch_do_not_mix() -> None:
     policy = expert_policy(LIMITS)
     near, far = ToyDoor(), ToyDoor(sliding=True)
     far.qpos = far.qpos + torch.tensor([[-0.3, 0.2, 0.1, 0.2, -0.1, 0.3, 0, 0]])
-    singles = [door.observe(policy.initial_state((1,))) for door in (near, far)]
+    singles = [door.observe(start()) for door in (near, far)]
     both = policy(torch.cat([td.clone() for td in singles]))
     for i, td in enumerate(singles):
         assert torch.allclose(both["action"][i], policy(td)["action"][0], atol=1e-5)
@@ -176,9 +170,9 @@ def test_environments_of_a_batch_do_not_mix() -> None:
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.3, -0.4, 0.9), (-1.2, 0.7, 1.5)])
 def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, float]) -> None:
-    policy, door = expert_policy(LIMITS), ToyDoor()
+    door = ToyDoor()
     door.qpos[:, 3:6] = torch.tensor(angles)
-    td = door.observe(policy.initial_state((1,)))
+    td = door.observe(start())
     tip, hand = door.tip(), hand_axis(td["observation", "tool_pose"])
     velocity, angular = torch.tensor([[0.3, -0.2, 0.4]]), torch.tensor([[0.2, 0.3, -0.1]])
     action = joint_velocities(td["observation"], hand, velocity, angular, LIMITS)
@@ -191,19 +185,19 @@ def test_joint_velocities_move_the_tip_as_asked(angles: tuple[float, float, floa
 
 
 def test_the_hand_is_kept_above_the_ground() -> None:
-    policy = expert_policy(LIMITS, FlowPolicyOptions(clearance=0.08))
-    down, tip = np.array([-0.1, 0.0, -0.995]), np.array([0.0, 0.0, 0.1])
-    lifted = policy._above_ground(down, tip)
-    assert np.linalg.norm(lifted) == pytest.approx(1.0, abs=1e-3)
-    assert tip[2] + HAND_LENGTH * lifted[2] == pytest.approx(0.08), "the far end of the gripper's own hand"
-    assert np.array_equal(policy._above_ground(-down, tip), -down)
+    down, tip = torch.tensor([[-0.1, 0.0, -0.995]]).double(), torch.tensor([[0.0, 0.0, 0.1]]).double()
+    lifted = above_ground(down, tip, 0.08)
+    assert float(lifted.norm()) == pytest.approx(1.0, abs=1e-3)
+    assert float(tip[0, 2] + HAND_LENGTH * lifted[0, 2]) == pytest.approx(0.08), "the far end of the gripper's own hand"
+    both = above_ground(torch.cat([down, -down]), tip.expand(2, 3), 0.08)
+    assert torch.equal(both, torch.cat([lifted, -down])), "one that points up is left as it is"
 
 
 def test_flowbot3d_sees_nothing_privileged_and_the_expert_differs_by_its_flow_alone() -> None:
     learned = artflownet_policy(ArtFlowNet(neighbors=8, generator=torch.Generator().manual_seed(0)), LIMITS)
     assert not [key for key in learned.in_keys if "privileged" in key]
     door = ToyDoor()
-    td = door.observe(FlowPolicy.initial_state((1,)))
+    td = door.observe(start())
     td["prediction", "flow"] = td["privileged", "flow"]
     same = FlowPolicy(("prediction", "flow"), LIMITS)(td.clone())["action"]
     assert torch.equal(same, expert_policy(LIMITS)(td)["action"])
@@ -212,11 +206,11 @@ def test_flowbot3d_sees_nothing_privileged_and_the_expert_differs_by_its_flow_al
 def test_the_flow_at_the_held_point_is_read_from_the_part_s_motion_where_the_hand_hides_it() -> None:
     policy, door = expert_policy(LIMITS, FlowPolicyOptions(lead=0.0)), ToyDoor()
     door.opened = 0.7
-    td = door.observe(policy.initial_state((1,)))
+    td = door.observe(start())
     points, flow = td["observation", "points"], td["privileged", "flow"]
     index = int(points[0, :, 1].argmin())
     seen = ((points - points[:, index : index + 1]).norm(dim=-1) > 0.25)[0]
-    state = policy.initial_state((1,))
+    state = start()
     state["phase"], state["pull"] = torch.full((1, 1), PULL), torch.tensor([[0.0, 0.0, 1.0]])
     td["observation", "tool_pose"][:, :3], td["observation", "attached"] = points[:, index], torch.ones(1, 1).bool()
     td["observation", "valid"], td["policy"] = seen[None], state
@@ -238,7 +232,7 @@ def test_a_door_is_opened_by_half_a_turn_without_drifting_off_the_held_point() -
 
 def test_a_hand_that_lost_hold_backs_off_from_there() -> None:
     policy, door = expert_policy(LIMITS), ToyDoor()
-    state, phases = policy.initial_state((1,)), []
+    state, phases = start(), []
     for step in range(150):
         td = policy(door.observe(state))
         state = td["next", "policy"]
@@ -255,7 +249,7 @@ def test_a_hand_that_lost_hold_backs_off_from_there() -> None:
 def test_a_stuck_hand_tears_itself_off_across_the_flow_and_tries_elsewhere() -> None:
     options = FlowPolicyOptions()
     policy, door = expert_policy(LIMITS, options), ToyDoor(sliding=True)
-    state, phases, touched = policy.initial_state((1,)), [], []
+    state, phases, touched = start(), [], []
     for _ in range(150):
         td = policy(door.observe(state))
         state = td["next", "policy"]
@@ -286,7 +280,7 @@ def policy_velocity(action: Tensor) -> Tensor:
 
 def test_a_hand_that_is_held_by_chance_keeps_its_direction() -> None:
     policy, door = expert_policy(LIMITS), ToyDoor()
-    state = policy(door.observe(policy.initial_state((1,))))["next", "policy"]
+    state = policy(door.observe(start()))["next", "policy"]
     assert int(state["phase"]) == TRAVEL
     door.qpos[:, 5] = 0.8  # turned about z on its way
     door.held = torch.tensor(0)
@@ -298,7 +292,7 @@ def test_a_hand_that_is_held_by_chance_keeps_its_direction() -> None:
 
 def test_a_hand_that_is_halted_on_its_way_goes_back_as_it_came_and_tries_elsewhere() -> None:
     policy, door = expert_policy(LIMITS), ToyDoor()
-    state, phases, wall = policy.initial_state((1,)), [], True
+    state, phases, wall = start(), [], True
     first: Tensor | None = None
     for _ in range(150):
         td = door.observe(state)
@@ -330,7 +324,7 @@ def test_the_policy_s_times_are_seconds_however_often_it_acts(frequency: int) ->
     policy, door = expert_policy(VelocityLimits(2.0, 3.0, period), options), ToyDoor()
 
     def seconds_until_it_leaves(phase: int, attached: bool, force: float) -> float:
-        state = policy.initial_state((1,))
+        state = start()
         tip = door.tip()
         state["phase"], state["contact_point"], state["tip"] = torch.full((1, 1), phase), tip, tip
         state["standoff"] = state["pull"] = torch.tensor([[-1.0, 0.0, 0.0]])
@@ -358,7 +352,7 @@ def test_what_counts_as_stuck_is_a_speed(frequency: int) -> None:
     policy = expert_policy(VelocityLimits(2.0, 3.0, period))
     for speed, stuck in ((0.07, True), (0.09, False)):
         door, phases = ToyDoor(sliding=True), []
-        state = policy.initial_state((1,))
+        state = start()
         state["phase"], state["tip"] = torch.full((1, 1), PULL), door.tip()
         state["standoff"] = state["pull"] = torch.tensor([[-1.0, 0.0, 0.0]])
         for _ in range(frequency):
@@ -382,7 +376,7 @@ def test_a_door_is_opened_at_any_frequency(frequency: int) -> None:
 @pytest.mark.parametrize("retries", [None, 0, 1])
 def test_after_its_last_retry_the_hand_stays_where_it_lost_hold(retries: int | None) -> None:
     policy, door = expert_policy(LIMITS, FlowPolicyOptions(retries=retries)), ToyDoor()
-    state, held, losses = policy.initial_state((1,)), False, 0
+    state, held, losses = start(), False, 0
     for _ in range(200):
         td = policy(door.observe(state))
         state = td["next", "policy"]
@@ -401,7 +395,7 @@ def test_after_its_last_retry_the_hand_stays_where_it_lost_hold(retries: int | N
 
 def test_without_retries_a_stuck_hand_pulls_on_and_a_failed_touch_is_the_last() -> None:
     policy, door = expert_policy(LIMITS, FlowPolicyOptions(retries=0)), ToyDoor(sliding=True)
-    state = policy(door.observe(policy.initial_state((1,))))["next", "policy"]
+    state = policy(door.observe(start()))["next", "policy"]
     state["phase"], state["pull"] = torch.full((1, 1), PULL), torch.tensor([[-1.0, 0.0, 0.0]])
     held = door.observe(state)
     held["observation", "attached"] = torch.ones(1, 1, dtype=torch.bool)
@@ -420,7 +414,7 @@ def test_without_retries_a_stuck_hand_pulls_on_and_a_failed_touch_is_the_last() 
 def test_without_a_mask_a_neighbour_s_flow_does_not_turn_the_pull() -> None:
     """Two drawers' flows at once: one goes out, the other one, half a metre away, to the side."""
     door = ToyDoor(sliding=True)
-    td = door.observe(FlowPolicy.initial_state((1,)))
+    td = door.observe(start())
     points, flow = td["observation", "points"], td["privileged", "flow"].clone()
     flow[points[..., 1] > 0.2] = torch.tensor([0.0, 0.0, 1.0])
     td["privileged", "flow"] = flow
@@ -437,7 +431,7 @@ def test_without_a_mask_a_neighbour_s_flow_does_not_turn_the_pull() -> None:
 
 def test_without_a_mask_the_largest_flow_of_the_whole_cloud_counts() -> None:
     policy = expert_policy(LIMITS, FlowPolicyOptions(mask="none"))
-    td = ToyDoor().observe(policy.initial_state((1,)))
+    td = ToyDoor().observe(start())
     with_mask = expert_policy(LIMITS)(td.clone())["next", "policy", "contact_point"]
     td["observation", "part_mask"] = torch.zeros_like(td["observation", "part_mask"])
     assert torch.equal(policy(td.clone())["next", "policy", "contact_point"], with_mask)

@@ -16,7 +16,6 @@ from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.gates import (
-    BUDGETED,
     GATES,
     EnsembleGate,
     LazyGate,
@@ -27,6 +26,7 @@ from fb3d_rl.policies.gates import (
     make_gate,
 )
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, OracleGate
+from fb3d_rl.policies.options import BUDGETED
 
 NAN = math.nan
 

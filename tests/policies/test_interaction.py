@@ -20,17 +20,8 @@ from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import make_env
-from fb3d_rl.policies.contact import LAYOUT
-from fb3d_rl.policies.flow_policy import (
-    APPROACH,
-    PULL,
-    RELEASE,
-    RETREAT,
-    SELECT,
-    TRAVEL,
-    FlowPolicy,
-    expert_policy,
-)
+from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
+from fb3d_rl.policies.flow_state import APPROACH, PULL, RELEASE, RETREAT, SELECT, TRAVEL, FlowState
 from fb3d_rl.policies.gates import make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, HumanGate, InteractivePolicy, OracleGate, uniform
@@ -92,7 +83,7 @@ def scene(count: int, attached: bool = False) -> TensorDict:
     content = {
         "observation": observation,
         "privileged": {"flow": flow},
-        "policy": FlowPolicy.initial_state((count,)),
+        "policy": FlowState.initial((count,)).packed(),
         "seed": torch.arange(count)[:, None],
         "elapsed_steps": torch.full((count, 1), 3),
     }
@@ -140,8 +131,8 @@ def test_keys_that_come_from_outside_and_those_that_do_not() -> None:
     made = {"action", ("expert", "action"), ("learner", "action"), ("learner", "discrepancy"), ("learner", "variance")}
     assert outside <= set(policy.in_keys) and not made & set(policy.in_keys)
     given = start(policy, scene(2))
-    assert set(policy.in_keys) <= set(given.keys(True, True)), "nothing else is needed"
-    assert set(policy.out_keys) <= set(policy(given).keys(True, True))
+    assert set(policy.in_keys) <= set(given.keys(True)), "nothing else is needed"
+    assert set(policy.out_keys) <= set(policy(given).keys(True))
     assert {"seed", "elapsed_steps"} <= set(InteractivePolicy(expert_policy(LIMITS), Learner(), BetaGate()).in_keys)
 
 
@@ -159,12 +150,18 @@ def looking_on(phases: list[int], sideways: float) -> TensorDict:
     """
     count = 2 * len(phases)
     towards = torch.tensor([-1.0, 0.0, 0.0])
-    td = TensorDict({"policy": FlowPolicy.initial_state((count,))}, batch_size=[count])
+    td = TensorDict({"policy": FlowState.initial((count,)).packed()}, batch_size=[count])
     td["policy", "phase"], td["policy", "idle"] = torch.tensor(phases * 2)[:, None], torch.full((count, 1), 5)
     td["policy", "standoff"] = td["policy", "pull"] = towards.expand(count, 3).clone()
     for k, side in enumerate((1.0, -1.0)):
-        candidate = torch.cat([torch.tensor([0.0, side, 0.0]), towards, towards, torch.ones(1)])
-        td["policy", "candidates"][:, k] = candidate
+        contact = {
+            "point": torch.tensor([0.0, side, 0.0]),
+            "flow": towards,
+            "standoff": towards,
+            "share": torch.ones(1),
+        }
+        for key, value in contact.items():
+            td["policy", "candidates", key][:, k] = value
     td["observation", "tool_pose"] = torch.tensor([-0.3, sideways, 0.0, 1.0, 0.0, 0.0, 0.0]).expand(count, 7)
     td["expert", "looks_on"] = (torch.arange(count) >= len(phases))[:, None]
     return td
@@ -182,7 +179,7 @@ def test_an_expert_that_looks_on_draws_no_conclusions_and_insists_on_no_plan(sid
     td = looking_on(phases, sideways)
     td["policy", "chosen"] = torch.full((12, 1), 2)
     before = td["policy"].clone()
-    InteractivePolicy(expert_policy(LIMITS), None, BetaGate()).look_on(td)
+    InteractivePolicy(expert_policy(LIMITS), None, BetaGate()).follow(td)
     assert td["policy", "phase"].flatten().tolist() == phases + after
     assert td["policy", "idle"].flatten().tolist() == [5] * 6 + [0] * 6
     chosen = [phase == TRAVEL for phase in after]
@@ -201,10 +198,11 @@ def test_the_label_of_one_that_looks_on_does_not_depend_on_what_it_meant_to_do()
     one.update(policy(one.clone())["next"])
     td = torch.cat([one] * 3)
     state, candidates = td["policy"], one["policy", "candidates"][0]
-    assert (candidates[:, -1] > 0).sum() >= 3
+    assert (candidates["share"] > 0).sum() >= 3
     for k, phase in enumerate((TRAVEL, APPROACH, APPROACH)):
         state["phase"][k] = phase
-        state["contact_point"][k], state["pull"][k], state["standoff"][k], _ = candidates[k].split(LAYOUT)
+        for key, value in (("contact_point", "point"), ("pull", "flow"), ("standoff", "standoff")):
+            state[key][k] = candidates[value][k]
     for looks_on in (True, False):
         td["expert", "looks_on"] = torch.full((3, 1), looks_on)
         labels = policy(td.clone())["expert", "action"]

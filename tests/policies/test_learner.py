@@ -13,13 +13,13 @@ from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.encoders import ENCODERS
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 from fb3d_rl.policies.learner import (
-    FELT,
+    HAND_FEATURES,
     INPUTS,
     Learner,
     LearnerOptions,
-    feel,
+    hand_features,
     history_of,
-    turned,
+    rotated,
     twist_of,
 )
 
@@ -142,10 +142,10 @@ def test_a_turned_situation_is_what_is_felt_in_the_turned_scene(mirrored: bool) 
     for key in ("points", "camera_position"):
         other["observation", key] = obs[key] @ turn.T
     other["privileged", "flow"] = td["privileged", "flow"] @ turn.T
-    # The hand in the turned scene: the same axis turned, whatever the spin about it.
+    # The hand in the turned scene: the same axis rotated, whatever the spin about it.
     axis, tip = hand_axis(obs["tool_pose"]), obs["tool_pose"][:, :3]
-    inputs, twist = policy.look(td), torch.randn(1, 1, 6, generator=generator(5))
-    got, label = turned(inputs, twist, torch.tensor([angle]), torch.tensor([mirrored]))
+    inputs, twist = policy.network_inputs(td), torch.randn(1, 1, 6, generator=generator(5))
+    got, label = rotated(inputs, twist, torch.tensor([angle]), torch.tensor([mirrored]))
     sign = -1.0 if mirrored else 1.0
     felt = inputs["felt"][0, 0]
     assert torch.allclose(got["points"], (obs["points"][:, :64] - tip) @ turn.T, atol=1e-5)
@@ -168,9 +168,9 @@ def test_it_remembers_what_it_felt_as_training_rows_say() -> None:
         td.update(state)
         remembered.append(td["learner", "felt"].clone())
         state = policy(td)["next"].select("learner")
-    felt = torch.cat([feel(td["observation"], LIMITS) for td in steps])
+    felt = torch.cat([hand_features(td["observation"], LIMITS) for td in steps])
     assert torch.allclose(torch.cat(remembered), history_of(felt, 2), atol=1e-6)
-    assert not remembered[0].any() and torch.allclose(remembered[3][0, 0], felt[2]) and felt.shape == (4, FELT)
+    assert not remembered[0].any() and torch.allclose(remembered[3][0, 0], felt[2]) and felt.shape == (4, HAND_FEATURES)
 
 
 def test_a_plan_is_executed_step_by_step_before_it_looks_again() -> None:
@@ -181,12 +181,12 @@ def test_a_plan_is_executed_step_by_step_before_it_looks_again() -> None:
         out = policy(td)
         twists.append(twist_of(td["observation"], out["action"], LIMITS)[0, :3])
         state = out["next"].select("learner")
-    inputs = policy.look(scene(1, 1))
+    inputs = policy.network_inputs(scene(1, 1))
     plan = policy.network(*(inputs[key] for key in INPUTS))[0]
     for k in range(3):
         wanted = plan[k, :3] / max(1.0, float(plan[k, :3].detach().abs().max()))
         assert torch.allclose(twists[k], wanted, atol=0.05)
-    again = policy.look(scene(1, 4))
+    again = policy.network_inputs(scene(1, 4))
     assert torch.allclose(twists[3], policy.network(*(again[key] for key in INPUTS))[0, 0, :3], atol=0.05)
 
 
@@ -195,7 +195,7 @@ def test_torchrls_loss_fits_the_label(head: str) -> None:
     policy = learner(head=head, width=16).train()
     loss = BCLoss(policy.actor(), loss_function="l2" if head == "deterministic" else None)
     loss.set_keys(action="twist")
-    inputs = policy.look(scene(8))
+    inputs = policy.network_inputs(scene(8))
     inputs["twist"] = 0.5 * torch.randn(8, 1, 6, generator=generator(7))
     optimizer = torch.optim.Adam(policy.parameters(), lr=0.01)
     values = []

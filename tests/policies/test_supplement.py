@@ -47,12 +47,12 @@ def test_it_is_the_largest_flow_or_the_nearest_flat_point_2_cm_away(rough: float
     wanted = by_the_book(points, flow, options.contact)
     assert (wanted == int(flow[0].norm(dim=-1).argmax())) == (rough == 0.0)
     for hand in (CAMERA, torch.tensor([[-1.0, 2.0, 0.5]])):  # wherever the hand is
-        point, pull, standoff, _ = choose_contact(
+        contact, _ = choose_contact(
             points, valid, valid, flow, CAMERA, hand, torch.tensor([[-1.0, 0.0, 0.0]]), ~valid, options.contact
         )
-        assert torch.equal(point[0], points[0, wanted])
-        assert torch.equal(standoff, pull), "the hand comes against the flow (I.F)"
-        torch.testing.assert_close(pull[0], flow[0, wanted] / flow[0, wanted].norm())
+        assert torch.equal(contact.point[0], points[0, wanted])
+        assert torch.equal(contact.standoff, contact.flow), "the hand comes against the flow (I.F)"
+        torch.testing.assert_close(contact.flow[0], flow[0, wanted] / flow[0, wanted].norm())
 
 
 def test_it_tries_once(options: FlowPolicyOptions) -> None:

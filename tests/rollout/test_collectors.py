@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import gc
+import inspect
 import logging
 import multiprocessing
 import os
+import re
 import signal
 from functools import partial
+from types import ModuleType
 from typing import Literal
 
 import pytest
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors.distributed import RayCollector
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.env.options import EnvOptions, Trial, default_trial
 from fb3d_rl.env.torchrl_env import TrialEnv, make_env
 from fb3d_rl.errors import UserError
-from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers, steady_floats
+from fb3d_rl.rollout import collectors, worker
+from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers
+from fb3d_rl.rollout.worker import steady_floats
 
 HORIZON = 6
 OPTIONS = EnvOptions(points=64, horizon=HORIZON)
@@ -163,15 +168,30 @@ def test_worker_processes(
 def test_ray(create: partial[TrialEnv], trials: list[Trial], expected: dict[float, list[Episode]]) -> None:
     ray = pytest.importorskip("ray", reason="Ray is not installed; install it to run this test")
     assert "its Ray worker died" in check("ray", 2, create, trials, expected)
-    # The finalizer of a collector that still has actors starts Ray anew.
-    left = [thing for thing in gc.get_objects() if isinstance(thing, RayCollector) and thing.remote_collectors]
-    assert not left and not ray.is_initialized()
+    gc.collect()  # the finalizer of a collector that still has actors starts Ray anew
+    assert not ray.is_initialized()
 
 
 def test_ray_is_asked_for_where_it_is_missing(create: partial[TrialEnv], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ray", None)
     with pytest.raises(UserError, match="pip install"):
         Workers(create, Policy("kill"), CollectorOptions("ray"), HORIZON)
+
+
+@pytest.mark.parametrize("module", [collectors, worker])
+def test_only_public_names_of_torchrl_are_used(module: ModuleType) -> None:
+    """Names that start with "_" are those of this package's own classes, which are no subclasses of TorchRL's."""
+    private = []
+    for scope in ast.parse(inspect.getsource(module)).body:
+        own = isinstance(scope, ast.ClassDef) and not scope.bases
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Attribute) and re.match("_(?!_)", node.attr):
+                if not (own and isinstance(node.value, ast.Name) and node.value.id == "self"):
+                    private.append(f"line {node.lineno}: .{node.attr}")
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(("torchrl", "tensordict")):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+                private += [f"line {node.lineno}: {name}" for name in names if "._" in name]
+    assert not private, f"{module.__name__} uses names that another TorchRL may not have: {private}"
 
 
 @pytest.mark.slow

@@ -97,10 +97,9 @@ def test_recorded_actions_lead_to_the_recorded_states_bit_for_bit(
     assert options == OPTIONS
     for episode, info in enumerate(buffer.episodes):
         frames = buffer.frames(episode)
-        create = partial(
-            create_env, [recorded_object(buffer, episode)], replace(options, horizon=info.rows), state_of()
-        )
-        with Workers(create, Replay(frames["action"]), CollectorOptions(), info.rows) as workers:
+        replay, shown = Replay(frames["action"]), replace(options, horizon=info.rows)
+        create = partial(create_env, [recorded_object(buffer, episode)], shown, state_of(replay))
+        with Workers(create, replay, CollectorOptions(), info.rows) as workers:
             (again,) = workers.run([trial_of(info)])
         assert again.frames is not None, again.error
         assert [key for key in differs_in(again, frames)] == []
@@ -199,7 +198,7 @@ def test_a_trajectory_file_that_record_episode_wrote_is_read(
     assert (info.steps, info.success) == (buffer.episodes[1].steps, buffer.episodes[1].success)
     with pytest.raises(UserError, match="from elsewhere"):
         trial_of(info)
-    with pytest.raises(UserError, match="does not tell how"):
+    with pytest.raises(UserError, match="does not say how"):
         recorded_options(read)
     with pytest.raises(UserError, match="--root"):
         recorded_object(read, 0)

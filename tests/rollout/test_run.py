@@ -118,6 +118,7 @@ class Astray(TensorDictModuleBase):
         super().__init__()
         self.expert = expert_policy(LIMITS, FlowPolicyOptions(mask="none"))
         self.in_keys, self.out_keys = [*self.expert.in_keys, ("privileged", "link")], self.expert.out_keys
+        self.initial_state = self.expert.initial_state
 
     def forward(self, td: TensorDictBase) -> TensorDictBase:
         link, true = td["privileged", "link"], td["privileged", "flow"]
@@ -194,6 +195,7 @@ class Deadly(TensorDictModuleBase):
     def __init__(self, camera: torch.Tensor) -> None:
         super().__init__()
         self.expert = expert_policy(LIMITS)
+        self.initial_state = self.expert.initial_state
         self.in_keys, self.out_keys = self.expert.in_keys, self.expert.out_keys
         self.camera = camera
 

@@ -14,9 +14,11 @@ from fb3d_rl.assets import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import MIN_VISIBLE, ObjectView, SampleOptions
+from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.kinematics.opening import openable_links, opening_range
 from fb3d_rl.rollout.trials import Scheduled, ScheduleOptions, schedule, trial_key
+from fb3d_rl.scene.observer import MIN_VISIBLE, observe
+from fb3d_rl.scene.posed import Posed
 
 OPTIONS = SampleOptions(points=300, camera=CameraOptions(resolution=48))
 
@@ -33,11 +35,10 @@ def test_one_trial_for_every_part_that_opens_and_shows(objects: list[tuple[Artic
     assert len(trials) + hidden == sum(len(openable_links(obj)) for obj, _ in objects) and len(trials) > hidden
     by_id = {obj.id: obj for obj, _ in objects}
     for item in trials:
-        view = ObjectView(by_id[item.trial.object], OPTIONS.camera)
-        _, links = view.cloud(
-            np.array(item.trial.start), item.trial.view, OPTIONS.points, np.random.default_rng(item.trial.seed)
-        )
-        assert np.isin(links, view.obj.descendants(item.trial.link)).sum() >= MIN_VISIBLE // 2
+        posed = Posed(by_id[item.trial.object], OPTIONS.camera)
+        rng = np.random.default_rng(item.trial.seed)
+        links = observe(posed, posed.poses(item.trial.start), item.trial.view, OPTIONS.points, rng).links
+        assert np.isin(links, posed.obj.descendants(item.trial.link)).sum() >= MIN_VISIBLE // 2
 
 
 def test_a_trial_depends_on_the_seed_and_its_object_alone(objects: list[tuple[ArticulatedObject, str]]) -> None:

@@ -21,7 +21,7 @@ from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.drawing import shade, signs, video
+from fb3d_rl.drawing import bodies, signs, video
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.flow_policy import expert_policy
@@ -123,7 +123,7 @@ def centre(mask: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 def test_the_part_to_open_is_blue_and_moves_as_its_joint_opens(film: Film) -> None:
     shot = Shot(film, *SMALL)
-    seen = [centre(matches(shot.picture(t), shade.TARGET)) for t in (10, 15, 20)]
+    seen = [centre(matches(shot.picture(t), bodies.TARGET)) for t in (10, 15, 20)]
     moved = shot.camera.project(np.array([[-0.6, 0, 0.5], [-0.6 - OPENING, 0, 0.5]]))
     wanted = moved[1] - moved[0]
     for before, after in zip(seen, seen[1:], strict=False):
@@ -195,7 +195,7 @@ def test_a_frame_for_each_moment_with_a_bar_of_how_far_the_part_is_open(film: Fi
     assert len(made) == len(film) == 21
     for t, image in enumerate(made):
         assert image.shape == (SMALL[1] + CAPTION, SMALL[0], 3) and image.dtype == np.uint8
-        bar = matches(image, shade.TARGET)[SMALL[1] + 1]
+        bar = matches(image, bodies.TARGET)[SMALL[1] + 1]
         assert bar.sum() == pytest.approx(SMALL[0] * film.opened[t], abs=1.5)
         assert bar[: bar.sum()].all()
     assert (made[9][-CAPTION:] != made[10][-CAPTION:]).any(), "the caption says whether suction holds"
@@ -267,7 +267,7 @@ def test_a_filmstrip_has_a_panel_for_each_moment(film: Film, tmp_path: Path) -> 
     assert len(starts) == len(ends) == len(moments(film)) == 6
     assert len(set((ends - starts).tolist())) == 1, "all of one width"
     last, first = image[:, starts[-1] : ends[-1]], image[:, starts[0] : ends[0]]
-    assert centre(matches(last, shade.TARGET))[0] != pytest.approx(centre(matches(first, shade.TARGET))[0], abs=2)
+    assert centre(matches(last, bodies.TARGET))[0] != pytest.approx(centre(matches(first, bodies.TARGET))[0], abs=2)
     write_filmstrip(film, tmp_path / "b.png", width=600)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 

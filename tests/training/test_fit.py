@@ -16,21 +16,15 @@ from torchrl.data import LazyMemmapStorage, ReplayBuffer
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.data.samples import ObjectView, SampleOptions, draw_sample
+from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
-from fb3d_rl.training.fit import (
-    FitOptions,
-    augment,
-    batch_rows,
-    emulates_bf16,
-    fit,
-    flow_loss,
-    learning_rate,
-    require_compiler,
-    resident,
-    rotate_about_z,
-)
+from fb3d_rl.scene.posed import Posed
+from fb3d_rl.training.device import emulates_bf16, require_compiler, resident
+from fb3d_rl.training.draws import augment, batch_rows, rotate_about_z
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.objective import flow_loss
+from fb3d_rl.training.options import FitOptions, learning_rate
 
 
 def make_rows(rows: int = 6, points: int = 64) -> TensorDict:
@@ -145,7 +139,7 @@ def test_two_hundred_steps_learn_one_cloud(
     """
     if precision == "bf16" and emulates_bf16(torch.device("cpu")):
         pytest.skip("bfloat16 is emulated here, which takes minutes")
-    view = ObjectView(procedural_objects["Microwave"], CameraOptions(resolution=48))
+    view = Posed(procedural_objects["Microwave"], CameraOptions(resolution=48))
     sample = draw_sample(view, SampleOptions(points=200), np.random.default_rng(0))
     assert sample is not None
     rows = sample[None]

@@ -1,8 +1,10 @@
 """Procedural articulated objects, written as PartNet-Mobility folders.
 
-They carry no third party's licence, so they are what the project trains on by default and what its tests use.
+No third party's licence applies to them, so they are what the project trains on by default and what its tests use.
 A family is a function from a random generator to an `ObjectSpec`; to add one, write the function and enter it
-in `FAMILIES`.
+in `FAMILIES`. Beside UMPNet's 21 categories there are families of mechanisms on bodies of any kind, `MECHANISMS`, in
+which geometry and not the category tells the motion, and groups of objects that look alike and move differently,
+`LOOKALIKES`.
 """
 
 from __future__ import annotations
@@ -11,25 +13,72 @@ import shutil
 import tempfile
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from fb3d_rl.assets.procedural import cabinets, frames, handheld, lidded
+from fb3d_rl.assets.procedural import (
+    appliances,
+    caps,
+    controls,
+    folding,
+    frames,
+    furniture,
+    handheld,
+    lidded,
+    lookalikes,
+    sliding,
+    turning,
+)
 from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
-from fb3d_rl.assets.splits import TRAIN_CATEGORIES
+from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
 from fb3d_rl.errors import UserError
 
-__all__ = ["FAMILIES", "ObjectSpec", "Part", "expand", "generate", "object_id", "sample"]
+__all__ = [
+    "FAMILIES",
+    "LOOKALIKES",
+    "MECHANISMS",
+    "ObjectSpec",
+    "Part",
+    "expand",
+    "generate",
+    "object_id",
+    "sample",
+]
+
+MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
+    "PushButton": controls.push_button,
+    "Lever": controls.lever,
+    "Slider": controls.slider,
+    "Knob": controls.knob,
+    "ControlPanel": controls.control_panel,
+    "PullCap": caps.pull_cap,
+    "TwistCap": caps.twist_cap,
+    "PumpCap": caps.pump_cap,
+    "FlipCap": caps.flip_cap,
+    "FoldingBlade": folding.folding_blade,
+    "FoldingLeg": folding.folding_leg,
+    "Swivel": turning.swivel,
+    "Wheel": turning.wheel,
+    "TelescopicHandle": sliding.telescopic_handle,
+    "Tray": sliding.tray,
+}
+"""Kinds of motion on bodies of any kind, size and orientation."""
+
+LOOKALIKES: dict[str, tuple[Callable[[np.random.Generator], ObjectSpec], ...]] = {
+    "AmbiguousDoor": tuple(partial(lookalikes.ambiguous_door, variant=k) for k in range(lookalikes.VARIANTS)),
+}
+"""Families in groups: so many objects with successive indices look alike, and each moves in its own way."""
 
 FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
-    "StorageFurniture": cabinets.storage_furniture,
-    "Table": cabinets.table,
-    "Refrigerator": cabinets.refrigerator,
-    "Microwave": cabinets.microwave,
-    "Safe": cabinets.safe,
-    "Oven": cabinets.oven,
-    "Dishwasher": cabinets.dishwasher,
+    "StorageFurniture": furniture.storage_furniture,
+    "Table": furniture.table,
+    "Refrigerator": appliances.refrigerator,
+    "Microwave": appliances.microwave,
+    "Safe": appliances.safe,
+    "Oven": appliances.oven,
+    "Dishwasher": appliances.dishwasher,
     "WashingMachine": frames.washing_machine,
     "Door": frames.door,
     "Window": frames.window,
@@ -44,8 +93,10 @@ FAMILIES: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "Stapler": handheld.stapler,
     "Switch": handheld.switch,
     "Toilet": handheld.toilet,
+    **MECHANISMS,
+    **{name: variants[0] for name, variants in LOOKALIKES.items()},
 }
-
+"""All families: UMPNet's 21 categories, mechanisms and look-alikes."""
 
 SKEWED = 0.15
 """Share of objects whose axes do not run along the coordinate axes."""
@@ -62,23 +113,32 @@ def object_id(category: str, seed: int, index: int) -> str:
 def sample(category: str, seed: int, index: int) -> ObjectSpec:
     """One object of a family, from a generator of its own: it depends on nothing but the three arguments.
 
+    Of look-alikes, those of a group share the generator: the group is their index // the group's size.
+
     Raises:
         UserError: If the category has no family or the seed is negative.
     """
     check([category], 1, seed)
-    rng = np.random.default_rng([seed, zlib.crc32(category.encode()), index])
-    spec = FAMILIES[category](rng)
+    makers = LOOKALIKES.get(category, (FAMILIES[category],))
+    group, variant = divmod(index, len(makers))
+    rng = np.random.default_rng([seed, zlib.crc32(category.encode()), group])
+    spec = makers[variant](rng)
     if rng.random() < SKEWED:
         spec = spec.turned(rng.uniform(-SKEW, SKEW))
     return spec.normalised()
 
 
 def expand(categories: Sequence[str]) -> list[str]:
-    """The names of families that words name: themselves, or "all", "train" or "test" (UMPNet's halves of them)."""
+    """The names of families that words name: themselves, or one of these.
+
+    "all" is UMPNet's 21 categories, "train" its 11 training categories, "test" the 10 others; "mechanisms" is the kinds
+    of motion on bodies of any kind, `MECHANISMS`. Look-alikes are in none of them: name them singly.
+    """
     groups = {
-        "all": list(FAMILIES),
+        "all": [name for name in FAMILIES if name in CATEGORIES],
         "train": [name for name in FAMILIES if name in TRAIN_CATEGORIES],
-        "test": [name for name in FAMILIES if name not in TRAIN_CATEGORIES],
+        "test": [name for name in FAMILIES if name in CATEGORIES and name not in TRAIN_CATEGORIES],
+        "mechanisms": list(MECHANISMS),
     }
     return list(dict.fromkeys(name for word in categories for name in groups.get(word, [word])))
 
@@ -94,7 +154,7 @@ def check(categories: Sequence[str], count: int, seed: int) -> None:
         wrong = f"No procedural family for category {unknown[0]!r}" if unknown else "No category was named"
         raise UserError(f"{wrong}: choose among {', '.join(FAMILIES)}.")
     if count < 1:
-        raise UserError(f"{count} procedural objects per category were asked for: ask for at least 1.")
+        raise UserError(f"The number of procedural objects per category is {count}: give a number of at least 1.")
     if seed < 0:
         raise UserError(f"The seed of procedural objects is {seed}: give a number of at least 0.")
 

@@ -120,10 +120,10 @@ def window(rng: np.random.Generator) -> ObjectSpec:
         else [(right, tracks[0], -1.0), (left, tracks[1], 1.0)]
     )
     movable = 2 if rng.random() < 0.4 else 1
-    looks = (style, replace(style, handle=replace(style.handle, kind="none")))  # no room before the rear pane
+    styles = (style, replace(style, handle=replace(style.handle, kind="none")))  # no room before the rear pane
     parts = []
     for k, (pane_x, pane_z, way) in enumerate(panes):
-        pane = panel("window_pane", looks[k], pane_x, pane_y, pane_z, "left" if way > 0 else "right")
+        pane = panel("window_pane", styles[k], pane_x, pane_y, pane_z, "left" if way > 0 else "right")
         if k < movable:
             travel = (pane_x[1] - pane_x[0] - lap) * rng.uniform(0.6, 0.9)
             parts.append(Part("translation_window", "slider", (way, 0, 0), travel, tuple(pane)))

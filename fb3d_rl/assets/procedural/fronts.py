@@ -84,6 +84,12 @@ def draw_handle(rng: np.random.Generator, bare: float = 0.12) -> HandleStyle:
     )
 
 
+def draw_front(rng: np.random.Generator, thickness: Range, bare: float = 0.12, framed: float = 0.4) -> FrontStyle:
+    """A random front style; panels have a frame with probability `framed`."""
+    rail = rng.uniform(0.03, 0.07) if rng.random() < framed else 0.0
+    return FrontStyle(draw_handle(rng, bare), rng.uniform(*thickness), rail, rng.uniform(0.2, 0.45), rng.random())
+
+
 def handle(style: HandleStyle, x: Range, y: Range, z: Range, edge: Side | None) -> list[Piece]:
     """Pieces of a handle on the panel x, y, z, near its free edge, or in its middle if edge is None.
 

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.shade import GHOST, Body, Camera, Color, Part, Placed, Studio
+from fb3d_rl.drawing.bodies import Body, Color, Part, Placed
+from fb3d_rl.drawing.camera import Camera
+from fb3d_rl.drawing.studio import GHOST, Studio
 
 RED, GREEN, BLUE, DARK = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.2, 0.9), (0.05, 0.05, 0.05)
 FRONT, SIDE = View(0.0, 20.0), View(-35.0, 25.0)

@@ -1,4 +1,4 @@
-"""What policies are told is what is declared, and nothing else."""
+"""Every policy and algorithm is there in full, and is told what is declared and nothing else."""
 
 from __future__ import annotations
 
@@ -9,24 +9,34 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from fb3d_rl.algos.dagger import acting_policy
-from fb3d_rl.algos.kinds import KINDS
+from fb3d_rl.algos.learners import acting_policy
+from fb3d_rl.algos.options import AlgoOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
-from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.flow_policy import MASK, FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import Learner, LearnerOptions
-from fb3d_rl.policies.truths import TOLD, table
+from fb3d_rl.registry import REGISTRY, behind, truths, truths_table
 from fb3d_rl.rollout.run import mask_of
 
+ROOT = Path(__file__).resolve().parents[1]
 LIMITS = VelocityLimits(2.0, 3.0)
 MASKED, MASKLESS = FlowPolicyOptions(), FlowPolicyOptions(mask="none")
 
 
+KINDS = [name for name, entry in REGISTRY.items() if entry.options == REGISTRY["artflownet"].options]
+TOLD = truths()
+
+
 def trained(name: str, options: FlowPolicyOptions, part_mask_input: bool = True) -> TensorDictModuleBase:
-    generator = torch.Generator().manual_seed(0)
-    return KINDS[name].policy(KINDS[name].network(part_mask_input, 8, "delayed", generator), LIMITS, options)
+    kind, generator = behind(REGISTRY[name].algorithm), torch.Generator().manual_seed(0)
+    made: TensorDictModuleBase = kind.policy(kind.network(part_mask_input, 8, "delayed", generator), LIMITS, options)
+    return made
+
+
+def untrained(name: str, options: FlowPolicyOptions) -> TensorDictModuleBase:
+    made: TensorDictModuleBase = behind(REGISTRY[name].act)(LIMITS, options)
+    return made
 
 
 def learned(flow: str, oracle: bool) -> TensorDictModuleBase:
@@ -35,14 +45,14 @@ def learned(flow: str, oracle: bool) -> TensorDictModuleBase:
 
 
 POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
-    "expert": lambda: expert_policy(LIMITS, MASKED),
-    "expert, policy.mask=none": lambda: expert_policy(LIMITS, MASKLESS),
+    "expert": lambda: untrained("expert", MASKED),
+    "expert, policy.mask=none": lambda: untrained("expert", MASKLESS),
     "artflownet": lambda: trained("artflownet", MASKED),
     "artflownet, policy.mask=none": lambda: trained("artflownet", MASKLESS, part_mask_input=False),
     "screwnet": lambda: trained("screwnet", MASKED),
     "ump_di": lambda: trained("ump_di", MASKED),
-    "normal": lambda: normal_policy(LIMITS, MASKED),
-    "random": lambda: RandomPolicy(),
+    "normal": lambda: untrained("normal", MASKED),
+    "random": lambda: untrained("random", MASKED),
     "bc, dagger": lambda: learned("none", False),
     "bc_flow, dagger_flow": lambda: learned("ground_truth", False),
     "bc_oracle, dagger_oracle": lambda: learned("none", True),
@@ -58,9 +68,9 @@ def test_a_policy_reads_what_is_declared(name: str) -> None:
     assert mask_of(policy) == ("target" if told.mask else "" if name == "random" else "none")
 
 
-def test_no_policy_is_missing_and_the_readme_says_the_same() -> None:
+def test_no_policy_is_missing_and_the_documents_say_the_same() -> None:
     assert set(POLICIES) == set(TOLD)
-    assert table() in (Path(__file__).parents[2] / "README.md").read_text()
+    assert truths_table() in (ROOT / "docs" / "protocols.md").read_text()
 
 
 def test_without_a_mask_the_network_s_module_reads_none_either() -> None:
@@ -73,4 +83,24 @@ def test_a_network_that_needs_the_mask_says_so(name: str) -> None:
     with pytest.raises(UserError, match=r"policy\.mask=target"):
         trained(name, MASKLESS)
     with pytest.raises(UserError, match=r"policy\.mask=target"):
-        normal_policy(LIMITS, MASKLESS)
+        untrained("normal", MASKLESS)
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_an_entry_is_complete(name: str) -> None:
+    entry = REGISTRY[name]
+    assert (ROOT / "conf" / "policy" / f"{name}.yaml").is_file()
+    assert (ROOT / "conf" / "algo" / f"{name}.yaml").is_file() == entry.trained
+    assert bool(entry.act) != entry.trained == bool(entry.options)
+    assert entry.told
+    if entry.trained:
+        algorithm = behind(entry.algorithm)
+        assert callable(algorithm.train) and callable(algorithm.load)
+        assert issubclass(behind(entry.options), AlgoOptions)
+    else:
+        assert callable(behind(entry.act))
+
+
+def test_files_of_policies_and_algorithms_are_of_entries() -> None:
+    """A file that names something else would compose and then be refused."""
+    assert {path.stem for path in (ROOT / "conf" / "policy").glob("*.yaml")} == set(REGISTRY)

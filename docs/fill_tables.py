@@ -1,0 +1,351 @@
+"""Fill the tables of results in README.md, docs/ and results/ from the summaries below results/.
+
+python docs/fill_tables.py             writes the tables anew
+python docs/fill_tables.py --check     only says which pages are not current; exit code 1 if any
+
+A page names a table between two comments, ``<!-- table: NAME -->`` and ``<!-- /table -->``; all else on the page is
+written by hand. A test runs the check.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "results"
+PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(RESULTS.glob("**/*.md")))
+MARK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- /table -->)", re.DOTALL)
+FLOW = ("flow/cosine", "flow/rmse", "flow/magnitude_error")
+
+Lines = list[str]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table: its label, the folder of the run and the policy whose numbers it shows."""
+
+    label: str
+    folder: str
+    policy: str
+
+
+Cell = Callable[[Row], str]
+
+
+@cache
+def summary(folder: str) -> dict[str, Any]:
+    """The summary of a folder below results/."""
+    found: dict[str, Any] = json.loads((RESULTS / folder / "summary.json").read_text())
+    return found
+
+
+def percent(value: float, decimals: int = 0) -> str:
+    """A share in percent; one that is not whole never reads 100 %."""
+    return f"{100 * value:.{1 if 0.995 <= value < 1 else decimals}f} %"
+
+
+def plain(value: float, decimals: int = 3) -> str:
+    """A number of at most 1 in size, without its leading zero."""
+    return f"{value:.{decimals}f}".replace("0.", ".", 1).replace("-", "−")
+
+
+def share(metric: str, below: str = ".", split: str = "", interval: bool = True, decimals: int = 0) -> Cell:
+    """A column of a share of trials: the mean over objects, with its 95 % interval.
+
+    Args:
+        metric: key of the summary, without the policy's name.
+        below: the folder below results/ that holds the runs.
+        split: the split it is limited to; "" for all trials.
+        interval: whether the interval is shown.
+        decimals: of the percentage.
+    """
+
+    def cell(row: Row) -> str:
+        numbers = summary(f"{below}/{row.folder}")
+        numbers = numbers["by_split"][split] if split else numbers
+        low, high = numbers[f"{row.policy}/{metric}_ci95"]
+        text = percent(numbers[f"{row.policy}/{metric}"], decimals)
+        return f"{text} ({100 * low:.0f}–{100 * high:.0f})" if interval else text
+
+    return cell
+
+
+def distance(below: str = ".") -> Cell:
+    """A column of the normalized distance."""
+    return lambda row: f"{summary(f'{below}/{row.folder}')[f'{row.policy}/normalized_distance']:.2f}"
+
+
+def labels(below: str) -> Cell:
+    """A column of the labels that a learner had; empty where there is none."""
+
+    def cell(row: Row) -> str:
+        count = summary(f"{below}/{row.folder}").get("labels") if row.policy == row.folder else None
+        return f"{count:,}" if count else ""
+
+    return cell
+
+
+def decision_ms(below: str) -> Cell:
+    """A column of the wall time of a decision."""
+
+    def cell(row: Row) -> str:
+        time = summary(f"{below}/{row.folder}").get(f"{row.policy}/time/decision_ms")
+        if time is None:  # the machine did other work
+            return "–"
+        return f"{time:.1f}" if time < 10 else f"{time:.0f}"
+
+    return cell
+
+
+def flow(key: str) -> Cell:
+    """A column of a flow metric of the run's network; empty for other policies."""
+    return lambda row: _flow_interval(summary(row.folder), key) if row.policy == "artflownet" else ""
+
+
+def table(header: Sequence[str], body: Sequence[Sequence[str]]) -> Lines:
+    """A table in Markdown."""
+    return [re.sub(r"\|  (?=\|)", "| ", f"| {' | '.join(line)} |") for line in (header, ["---"] * len(header), *body)]
+
+
+def trials(rows: Sequence[Row], columns: Mapping[str, Cell]) -> Lines:
+    """A table with a line for each policy."""
+    return table(["", *columns], [[row.label, *(cell(row) for cell in columns.values())] for row in rows])
+
+
+IMITATION = (
+    Row("expert", "dagger", "expert"),
+    Row("ArtFlowNet", "artflownet", "artflownet"),
+    Row("BC", "bc", "bc"),
+    Row("BC + F", "bc_flow", "bc_flow"),
+    Row("DAgger E2E", "dagger", "dagger"),
+    Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
+    Row("DAgger Oracle", "dagger_oracle", "dagger_oracle"),
+    Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
+)
+"""The supplement's comparison; a run of each algorithm below one folder, which a column names."""
+
+POLICIES = (
+    Row("expert (true flow)", "expert", "expert"),
+    Row("ArtFlowNet", "artflownet", "artflownet"),
+    Row("ArtFlowNet, no part mask", "artflownet_no_mask", "artflownet"),
+    Row("ArtFlowNet, no part mask, any viewpoint", "artflownet_no_mask_vpa", "artflownet"),
+    Row("UMP-DI (told where to touch)", "ump_di", "ump_di"),
+    Row("screw parameters", "screwnet", "screwnet"),
+    Row("surface normal", "normal", "normal"),
+    Row("BC", "bc", "bc"),
+    Row("BC + F (told the true flow)", "bc_flow", "bc_flow"),
+    Row("DAgger E2E", "dagger", "dagger"),
+    Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
+    Row("DAgger Oracle (driven to the contact point)", "dagger_oracle", "dagger_oracle"),
+    Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
+    Row("random", "random", "random"),
+)
+"""results/comparison."""
+
+
+TWO = (Row("expert (true flow)", "", "expert"), Row("ArtFlowNet", "", "artflownet"))
+"""Both policies of one run, whose folder the columns name."""
+
+
+def headline() -> Lines:
+    """Three test sets side by side, with the number of trials and objects of each."""
+    sets = {
+        "new objects of known kinds": ("imitation", ""),
+        "categories never trained on": ("imitation_unseen", "test"),
+        "real objects (PartNet-Mobility)": ("imitation_partnet_mobility", ""),
+    }
+    columns = {}
+    for name, (folder, split) in sets.items():
+        numbers = summary(f"{folder}/dagger")
+        numbers = numbers["by_split"][split] if split else numbers
+        header = f"{name}: {numbers['n']} trials on {numbers['n_objects']} objects"
+        columns[header] = share("success_rate", folder, split)
+    return trials(IMITATION, columns)
+
+
+def imitation() -> Lines:
+    """Held-out procedural objects."""
+    below = "imitation"
+    return trials(IMITATION, {
+        "contact": share("contact_rate", below),
+        "success": share("success_rate", below),
+        "success once it holds the part": share("motion_only_success_rate", below, interval=False),
+        "normalized distance": distance(below),
+    })  # fmt: skip
+
+
+def imitation_unseen() -> Lines:
+    """Categories that were never trained on."""
+    below = "imitation_unseen"
+    return trials(IMITATION, {
+        "success, seen categories": share("success_rate", below, "train_test"),
+        "contact, unseen ones": share("contact_rate", below, "test"),
+        "success, unseen ones": share("success_rate", below, "test"),
+        "once it holds the part": share("motion_only_success_rate", below, "test", interval=False),
+    })  # fmt: skip
+
+
+def imitation_partnet_mobility() -> Lines:
+    """Real objects; the labels that each learner had stand beside."""
+    below = "imitation_partnet_mobility"
+    return trials(IMITATION, {
+        "labels": labels(below),
+        "contact": share("contact_rate", below),
+        "success": share("success_rate", below),
+        "success, class mean": share("success_rate_class_mean", below, interval=False),
+        "success once it holds the part": share("motion_only_success_rate", below, interval=False),
+        "normalized distance": distance(below),
+    })  # fmt: skip
+
+
+def comparison() -> Lines:
+    """Every policy on the same trials, by split."""
+    below = "comparison"
+    return trials(POLICIES, {
+        "real, train_test": share("success_rate", below, "train_test"),
+        "real, test": share("success_rate", below, "test"),
+        "procedural, seen families": share("success_rate", below, "procedural_train_test"),
+        "procedural, unseen families": share("success_rate", below, "procedural_test"),
+        "contact, all": share("contact_rate", below, interval=False),
+        "ms a decision": decision_ms(below),
+    })  # fmt: skip
+
+
+def procedural() -> Lines:
+    """What ``make train`` measures."""
+    rows = [replace(row, folder="procedural") for row in TWO]
+    return trials(rows, {
+        "contact": share("contact_rate"),
+        "success": share("success_rate"),
+        "normalized distance": distance(),
+        "flow cosine": flow("flow/cosine"),
+        "RMSE": flow("flow/rmse"),
+        "magnitude error": flow("flow/magnitude_error"),
+    })  # fmt: skip
+
+
+def partnet_mobility() -> Lines:
+    """Real objects, trained on the real objects of train_train."""
+    rows = [replace(row, folder="partnet_mobility") for row in TWO]
+    return trials(rows, {
+        "contact": share("contact_rate", decimals=1),
+        "success": share("success_rate", decimals=1),
+        "success, class mean": share("success_rate_class_mean", interval=False, decimals=1),
+        "normalized distance": distance(),
+    })  # fmt: skip
+
+
+def _flow_interval(numbers: dict[str, Any], key: str, decimals: int = 2) -> str:
+    low, high = (plain(end, 2) for end in numbers[key + "_ci95"])
+    return f"{plain(numbers[key], decimals)} ({low}–{high})"
+
+
+def _two_means(numbers: dict[str, Any], key: str) -> str:
+    return f"{plain(numbers[key])} / {plain(numbers[key + '_class_mean'])}"
+
+
+def flow_published() -> Lines:
+    """Flow on real objects beside what FlowBot3D's release reports; the better of the same target in bold."""
+    published = json.loads((ROOT / "fb3d_rl/evaluation/published.json").read_text())["flow"]["values"]
+    numbers, body = summary("partnet_mobility"), []
+    for split, name in {"train_test": "train_test", "test": "test (unseen)"}.items():
+        own, every = numbers["by_split"][split], numbers["flow_all_parts"]["by_split"][split]
+        means = (published[split]["mask"][f"{mean} mean"] for mean in ("instance", "class"))
+        ours, theirs = [], []
+        for key, instance, class_ in zip(FLOW, *means, strict=True):
+            wins = (every[key] > instance) == (key == "flow/cosine")
+            ours.append(_bold(_two_means(every, key), wins))
+            theirs.append(_bold(f"{plain(instance)} / {plain(class_)}", not wins))
+        body.append([f"{name}: ours, the part to open", *(_two_means(own, key) for key in FLOW)])
+        body.append([f"{name}: ours, all movable parts", *ours])
+        body.append([f"{name}: published, all movable parts", *theirs])
+    return table(["flow, part to open given by a mask", "cosine", "RMSE", "magnitude error"], body)
+
+
+def _bold(text: str, bold: bool) -> str:
+    return f"**{text}**" if bold else text
+
+
+TRANSFER = {
+    "94 real objects": "partnet_mobility",
+    "1,260 procedural ones, no real one": "transfer_procedural",
+    "94 real and 126 procedural ones": "transfer_mixed",
+}
+"""What the same network was trained on."""
+
+
+def transfer() -> Lines:
+    """The flow of the part to open on the same real objects."""
+    body = []
+    for name, folder in TRANSFER.items():
+        numbers = summary(folder)
+        splits = [_two_means(numbers["by_split"][split], "flow/cosine") for split in ("train_test", "test")]
+        body.append([name, *(_flow_interval(numbers, key, 3) for key in FLOW), *splits])
+    return table(["trained on", "cosine", "RMSE", "magnitude error", "cosine, train_test", "cosine, test"], body)
+
+
+def transfer_categories() -> Lines:
+    """The same by category: means over the objects of each."""
+    runs = [summary(folder)["by_category"] for folder in TRANSFER.values()]
+    objects = category_sizes()
+    body = [
+        [name, str(objects[name]), *(f"{run[name]['flow/cosine']:.2f}" for run in runs)] for name in sorted(runs[0])
+    ]
+    return table(["category", "objects", "trained on real ones", "on procedural ones", "on both"], body)
+
+
+def category_sizes() -> dict[str, int]:
+    """Held-out real objects of each category, as the rows of the flow tell."""
+    with (RESULTS / "partnet_mobility" / "flow_rows.csv").open(newline="") as file:
+        found = {(row["category"], row["object"]) for row in csv.DictReader(file)}
+    return {name: sum(category == name for category, _ in found) for name, _ in found}
+
+
+def pretrained() -> Lines:
+    """The published network on held-out real objects, by split."""
+    row, body = Row("", "transfer_mixed", "artflownet"), []
+    for split in ("train_test", "test"):
+        numbers = summary(row.folder)["by_split"][split]
+        sizes = f"{numbers['n_objects']} objects, {numbers['n']} trials"
+        success = share("success_rate", split=split)(row)
+        body.append([split, sizes, *(_flow_interval(numbers, key, 3) for key in FLOW), success])
+    return table(["", "", "cosine", "RMSE", "magnitude error", "success"], body)
+
+
+TABLES: dict[str, Callable[[], Lines]] = {
+    function.__name__: function
+    for function in (
+        headline, imitation, imitation_unseen, imitation_partnet_mobility, comparison, procedural, partnet_mobility,
+        flow_published, transfer, transfer_categories, pretrained,
+    )
+}  # fmt: skip
+
+
+def filled(text: str) -> str:
+    """A page with its tables as the results are now."""
+    return MARK.sub(lambda found: "\n".join([found[1], *TABLES[found[2]](), "", found[3]]), text)
+
+
+def main() -> int:
+    """Fill or check the pages."""
+    parser = argparse.ArgumentParser(description="Fill the tables of results in README.md, docs/ and results/.")
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if a page is not current")
+    options = parser.parse_args()
+    old = [page for page in PAGES if filled(page.read_text()) != page.read_text()]
+    for page in old:
+        print(f"{'not current' if options.check else 'wrote'}: {page.relative_to(ROOT)}")
+        if not options.check:
+            page.write_text(filled(page.read_text()))
+    return 1 if old and options.check else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

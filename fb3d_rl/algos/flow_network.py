@@ -1,0 +1,276 @@
+"""Draw flow samples, fit a network to them, then measure it and let it open things: algo=artflownet, screwnet, ump_di.
+
+What these do not share stands in a :class:`FlowNetwork` each, in the module of that name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import TensorDictReplayBuffer, TensorStorage
+
+from fb3d_rl.algos import setup
+from fb3d_rl.algos.aggregation import meet_samples
+from fb3d_rl.algos.algorithm import Acting
+from fb3d_rl.algos.weights import BEST, CHECKPOINT, best_cosine, load_network, load_trained, state_before
+from fb3d_rl.assets.catalog import Entry
+from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
+from fb3d_rl.data.options import SampleOptions
+from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation.evaluate import Protocol, evaluate, progress_bars
+from fb3d_rl.evaluation.flow import held_out_samples, predict
+from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
+from fb3d_rl.kinematics.opening import openable_links
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.options import content, taken
+from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
+from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.options import FlowPolicyOptions
+from fb3d_rl.rollout.rows import TrialRow
+from fb3d_rl.seeds import derived
+from fb3d_rl.training.checkpoint import fitting, git_revision, save_checkpoint
+from fb3d_rl.training.device import emulates_bf16, require_compiler
+from fb3d_rl.training.fit import fit
+from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
+from fb3d_rl.training.processes import rank_and_count, wait_for_all
+from fb3d_rl.training.run_log import RunLog, open_logger
+from fb3d_rl.training.state import check_state
+
+if TYPE_CHECKING:
+    from fb3d_rl.algos.options import FlowNetworkOptions
+    from fb3d_rl.config import TrainConfig
+
+SAMPLES = "samples"
+"""The run's data set; data.dataset gives it to another run."""
+
+VALIDATION_SAMPLES = 64
+
+MET = "met"
+"""The clouds that the policy of data.met_by met."""
+
+Measure: TypeAlias = "Callable[[CloudNetwork, TensorDictBase, torch.device], dict[str, Tensor]]"
+"""Numbers of samples [S], each [S], "cosine" among them: in validation the network with the largest is the best."""
+
+
+def flow_numbers(net: CloudNetwork, samples: TensorDictBase, device: torch.device) -> dict[str, Tensor]:
+    """The flow's errors on samples [S], see :func:`flow_metrics`."""
+    flow, valid = samples["privileged", "flow"], samples["observation", "valid"]
+    return flow_metrics(predict(net, samples, device), flow, valid)
+
+
+@dataclass(frozen=True)
+class FlowNetwork:
+    """The algorithm (:class:`~fb3d_rl.algos.algorithm.Algorithm`) of a network that is trained on flow samples.
+
+    Attributes:
+        network: the class.
+        policy: of a network on the CPU.
+        objective: what is minimized; None for the loss of the flow.
+        measure: in validation.
+        flow: whether the network answers the flow of a whole cloud.
+    """
+
+    network: type[CloudNetwork]
+    policy: Callable[[CloudNetwork, VelocityLimits, FlowPolicyOptions], TensorDictModuleBase] = artflownet_policy
+    objective: Callable[[nn.Module, FitOptions], Objective] | None = None
+    measure: Measure = flow_numbers
+    flow: bool = True
+
+    def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
+        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`; no rows in the processes that only fit beside the first."""
+        if rank_and_count()[0]:
+            assist(self, cfg, out)
+            return []
+        return run(self, cfg, out)
+
+    def load(self, path: str | Path) -> Acting:
+        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`."""
+        return self.acting(load_trained(path, self.network))
+
+    def acting(self, net: CloudNetwork) -> Acting:
+        """What acts with a network."""
+        policy = partial(self.policy, net)
+        return Acting(self.network.NAME, policy, net.part_mask_input, net if self.flow else None)
+
+
+def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
+    """Train on the configured objects and evaluate on the held-out ones."""
+    # Whatever the configuration can get wrong shows here, before any work.
+    protocol = setup.protocol(cfg, cfg.resume)
+    device = protocol.device
+    limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
+    resume = state_before(cfg, out)
+    logger = open_logger(cfg.logger.name, cfg.logger.project, out)
+    options, net = fit_options(cfg), new_network(kind, cfg)
+    if resume is not None:
+        with fitting(out / CHECKPOINT):
+            check_state(net, options, resume["state"])
+        best_cosine(out / BEST)
+    met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
+    if met_by is not None:
+        setup.require_simulator()
+    require_products(options, device)
+    entries = setup.train_entries(cfg.assets, out, cfg.seed)
+    objects = setup.load(entries.held_out)
+
+    if cfg.data.dataset:
+        require_unseen(Path(cfg.data.dataset), [*entries.validation, *entries.held_out])
+    else:
+        draw_samples(cfg, [entry.folder for entry in entries.train], protocol.samples, out / SAMPLES)
+    if met_by is not None:
+        meet(cfg, out, met_by, entries.train, protocol)
+    wait_for_all()
+    buffer = training_rows(cfg, out)
+    validation = validation_samples(entries.validation, protocol.samples, cfg.seed)
+
+    def checkpoint(state: dict[str, Any]) -> None:
+        save_checkpoint(out / CHECKPOINT, algo=cfg.algo.name, config=content(cfg), model_kwargs=net.arguments,
+                        state=state, seed=cfg.seed)  # fmt: skip
+
+    if resume is None:
+        (out / BEST).unlink(missing_ok=True)
+    with RunLog(out, resume_step=resume["step"] if resume else None, logger=logger) as run_log:
+        fit(net, buffer, options, objective=kind.objective and kind.objective(net, options), device=device,
+            evaluate=partial(validate, kind, validation, device, out / BEST, cfg.seed), log=run_log.write,
+            on_checkpoint=checkpoint, resume=resume["state"] if resume else None)  # fmt: skip
+
+    policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
+    fitted = kind.acting(net.to("cpu"))
+    policies[fitted.name] = fitted.policy(limits, speeds)
+    return evaluate(out, objects, policies, protocol, setup.facts(cfg, entries.train), fitted.network)
+
+
+def validate(
+    kind: FlowNetwork, samples: TensorDictBase | None, device: torch.device, best: Path, seed: int, measured: nn.Module
+) -> dict[str, float]:
+    """Numbers of a network on the validation objects, whose weights are kept in the file ``best`` if they are that.
+
+    Nothing that is evaluated in the end is looked at before.
+    """
+    if samples is None:
+        return {}
+    net = cast(CloudNetwork, measured)
+    numbers = {f"val/{key}": value for key, value in mean_metrics(kind.measure(net, samples, device)).items()}
+    if numbers["val/cosine"] > best_cosine(best):
+        about = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(seed), "git_revision": git_revision()}
+        net.save_pretrained(best, about)
+    return numbers
+
+
+def require_products(options: FitOptions, device: torch.device) -> None:
+    """Check that the device can compute as the options say, and note where it is slow at it.
+
+    Raises:
+        UserError: there is no compiler.
+    """
+    if options.compile:
+        require_compiler(device)
+    if options.precision == "bf16" and emulates_bf16(device):
+        print(
+            "note: this processor has no AVX-512, without which algo.precision=bf16 is several times slower than fp32"
+        )
+
+
+def meet(cfg: TrainConfig, out: Path, met_by: ArtFlowNet, train: list[Entry], protocol: Protocol) -> None:
+    """Let an ArtFlowNet's policy meet clouds of the training objects, with a progress bar."""
+    loaded, count = [entry.load() for entry in train], cfg.data.met_samples
+    own = setup.settled(replace(cfg, policy=replace(cfg.policy, mask=None)), met_by.part_mask_input)
+    speeds, meeting = setup.flow_policy_options(own), replace(protocol, env=setup.env_options(own))
+    acting = artflownet_policy(met_by, setup.velocity_limits(cfg), speeds)
+    made_by = {"weights": met_by.digest(), "policy": asdict(speeds)}
+    with progress_bars() as bar:
+        task = bar.add_task("clouds met", total=count)
+        meet_samples(out / MET, loaded, acting, count, meeting, made_by, lambda n: bar.update(task, completed=n))
+
+
+def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:
+    """Samples of the validation objects, some ``VALIDATION_SAMPLES`` in all; None where there is no object."""
+    objects = setup.load(entries)
+    if not any(openable_links(obj) for obj, _ in objects):
+        return None
+    count = max(2, math.ceil(VALIDATION_SAMPLES / len(objects)))
+    return held_out_samples(objects, options, count, derived(seed, "validation"), ("part",))["part"][0]
+
+
+def require_unseen(dataset: Path, entries: list[Entry]) -> None:
+    """Check that a whole data set of another run holds none of the objects that this one validates and evaluates on.
+
+    Raises:
+        UserError: it does.
+    """
+    # Earlier versions kept folders in place of ids with digests.
+    drawn = {Path(item).name if isinstance(item, str) else item[0] for item in recipe_of(dataset)["objects"]}
+    seen = sorted(entry.id for entry in entries if entry.id in drawn)
+    if seen:
+        raise UserError(
+            f"data.dataset={dataset} holds clouds of {len(seen)} objects that are validated or evaluated on "
+            f"({', '.join(seen[:3])} ...): give the assets and the seed of the run that drew it"
+        )
+
+
+def assist(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> None:
+    """Fit beside the first of several processes, which does all the rest, once the samples are there."""
+    device, options = setup.choose_device(cfg.device), fit_options(cfg)
+    resume = state_before(cfg, out)
+    net = new_network(kind, cfg)
+    wait_for_all()
+    rows, state = training_rows(cfg, out), resume["state"] if resume else None
+    fit(net, rows, options, device=device, resume=state, progress=False)
+
+
+def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> None:
+    """Draw the flow samples to train on, with a progress bar."""
+    count, workers = cfg.data.train_samples, setup.workers(cfg.data.workers)
+    with progress_bars() as bar:
+        task = bar.add_task("flow samples", total=count)
+        generate_samples(out, folders, count, cfg.seed, samples, workers, lambda n: bar.update(task, completed=n))
+
+
+def training_rows(cfg: TrainConfig, out: Path) -> Joined:
+    """What is trained on: flow samples, and behind them what a policy met."""
+    folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
+    parts = [load_samples(folder) for folder in folders]
+    return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(part)) for part in parts))
+
+
+def fit_options(cfg: TrainConfig) -> FitOptions:
+    """How the network is fitted.
+
+    Raises:
+        UserError: the batch cannot be shared out to the processes that fit together.
+    """
+    algo, processes = cast("FlowNetworkOptions", cfg.algo), rank_and_count()[1]
+    if algo.batch_size % processes:
+        raise UserError(f"algo.batch_size={algo.batch_size} cannot be shared out to {processes} processes equally")
+    rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
+    rows += cfg.data.met_samples if cfg.data.met_by else 0
+    return taken(FitOptions, algo, steps=math.ceil(algo.epochs * rows / algo.batch_size), seed=cfg.seed)
+
+
+def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
+    """The network to train: its weights depend on the seed alone, or are those of ``algo.start_from``.
+
+    Raises:
+        UserError: these are another network's.
+    """
+    algo = cast("FlowNetworkOptions", cfg.algo)
+    generator = torch.Generator().manual_seed(cfg.seed)
+    net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator)
+    if algo.start_from:
+        begun = load_trained(algo.start_from, kind.network)
+        if begun.arguments != net.arguments:
+            different = [f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments[key] != value]
+            raise UserError(f"algo.start_from={algo.start_from} is another network; give {' '.join(different)}")
+        net.load_state_dict(begun.state_dict())
+    return net

@@ -1,0 +1,152 @@
+"""What imitation trains: learners, the buffer's rows as their loss takes them, and the loss."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.objectives import BCLoss
+
+from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.data.picking import Index, pick
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.policies.ensemble import Ensemble
+from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.gates import PREDICTED, make_gate
+from fb3d_rl.policies.hand import VelocityLimits
+from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
+from fb3d_rl.policies.learner import INPUTS, Learner, rotated
+from fb3d_rl.policies.options import LearnerOptions
+from fb3d_rl.seeds import derived
+from fb3d_rl.training.draws import generator
+from fb3d_rl.training.objective import Objective
+
+if TYPE_CHECKING:
+    from fb3d_rl.algos.options import ImitationOptions
+
+# TorchRL 0.14.1 says so of its own BCLoss, in which it left out two annotations.
+warnings.filterwarnings("ignore", message="The name target_actor_network_params wasn't part")
+TURN = 4
+"""Purpose of random draws; see :func:`fb3d_rl.training.draws.generator`."""
+
+
+class Labels:
+    """The buffer's rows as the loss takes them: with the expert's twists of ``chunk`` steps as "twist" and "is_pad".
+
+    A plan that outlasts its episode is padded; the padding is no part of the loss.
+    """
+
+    def __init__(self, buffer: DemonstrationBuffer, chunk: int) -> None:
+        self._buffer, self._chunk = buffer, chunk
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+    def __getitem__(self, index: Index) -> TensorDictBase:
+        return pick(index, len(self), self._take)
+
+    def _take(self, index: Tensor) -> TensorDictBase:
+        rows = self._buffer[index]
+        steps = torch.arange(self._chunk)
+        ahead = (index[:, None] + steps).clamp(max=len(self) - 1)
+        later = rows[:, None] if self._chunk == 1 else self._buffer[ahead.flatten()].view(len(index), self._chunk)
+        rows["twist"] = later["expert", "twist"]
+        follows = later["elapsed_steps"].squeeze(-1) == rows["elapsed_steps"] + steps
+        rows["is_pad"] = ~(follows & (later["episode"].squeeze(-1) == rows["episode"]))
+        return rows
+
+
+def new_learner(
+    options: LearnerOptions, limits: VelocityLimits, members: int, seed: int, flow_net: ArtFlowNet | None = None
+) -> Learner | Ensemble:
+    """A learner, or an ensemble of several, with first weights that depend on the seed alone."""
+    each = [
+        Learner(options, limits, torch.Generator().manual_seed(nth(seed, "member", k)), flow_net).eval()
+        for k in range(members)
+    ]
+    return each[0] if members == 1 else Ensemble(each)
+
+
+def nth(seed: int, what: str, number: int) -> int:
+    """The seed of member or round ``number``: the run's own for the first, else one that no other run has."""
+    return derived(seed, what, number) if number else seed
+
+
+def members(learner: Learner | Ensemble) -> list[Learner]:
+    """The learners of an ensemble, or the learner."""
+    return [learner] if isinstance(learner, Learner) else [cast(Learner, member) for member in learner.members]
+
+
+def networks(learner: Learner | Ensemble) -> nn.ModuleList:
+    """What is trained of the learner."""
+    return nn.ModuleList(member.network for member in members(learner))
+
+
+def flow_network(learner: Learner | Ensemble) -> ArtFlowNet | None:
+    """The network that predicts the flow for the learner, if it has one."""
+    return members(learner)[0].flow_network
+
+
+def acting_policy(expert: FlowPolicy, learner: Learner | Ensemble, oracle: bool) -> TensorDictModuleBase:
+    """The policy that is evaluated: the learner alone, or with an oracle that drives to the contact point."""
+    learner.eval()
+    return InteractivePolicy(expert, learner, OracleGate()) if oracle else learner
+
+
+def policy_name(algo: ImitationOptions) -> str:
+    """The policy's name in tables, such as "dagger_oracle_flow"."""
+    flow = {"none": "", "ground_truth": "_flow", "artflownet": "_artflow"}[algo.learner.flow]
+    gate = "" if algo.gate.name == "beta" else f"_{algo.gate.name}"
+    return algo.name + gate + ("_oracle" if algo.oracle else "") + flow
+
+
+def new_gate(algo: ImitationOptions) -> Gate:
+    """Who acts while labels are collected: the gate, beside it the schedule's share of the expert, and the oracle."""
+    mixture = BetaGate(per_step=algo.beta.mixing == "step")
+    gates: list[Gate] = [mixture]
+    if algo.gate.name != "beta":
+        gates.append(make_gate(algo.gate.name, **cast("dict[str, Any]", algo.gate.options)))
+    if algo.oracle:
+        gates.append(OracleGate())
+    return gates[0] if len(gates) == 1 else EitherGate(*gates)
+
+
+def learner_options(algo: ImitationOptions) -> LearnerOptions:
+    """The learner's network; it predicts its distance from the expert if the gate asks for that."""
+    return replace(algo.learner, discrepancy=PREDICTED in new_gate(algo).in_keys)
+
+
+def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, seed: int) -> Objective:
+    """TorchRL's BCLoss of every member on situations that are rotated and mirrored at random.
+
+    A member that predicts its distance from the expert learns that too; it is taken between twists, which are
+    normalised as actions are.
+    """
+    losses = []
+    for member in members(learner):
+        loss = BCLoss(member.actor(), loss_function=None if algo.learner.head == "gaussian" else algo.loss)
+        loss.set_keys(action="twist", pad_mask=None if algo.learner.head == "gaussian" else "is_pad")
+        losses.append(loss)
+    most = math.radians(algo.turn)
+
+    def objective(rows: TensorDictBase, step: int) -> Tensor:
+        values = []
+        for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
+            draws = torch.rand(2, len(rows), generator=generator(nth(seed, "member", k), TURN, step)).to(rows.device)
+            mirrored = (draws[1] < 0.5) & algo.mirror
+            inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * most, mirrored)
+            inputs["twist"], inputs["is_pad"] = twist, rows["is_pad"]
+            values.append(loss(inputs)["loss_bc"])
+            if member.options.discrepancy:
+                said, *_, distance = member.network(*(inputs[key] for key in INPUTS))
+                true = (said[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
+                values.append(nn.functional.smooth_l1_loss(distance, true, beta=0.1))
+        return torch.stack(values).mean()
+
+    return objective

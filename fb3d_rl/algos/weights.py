@@ -1,0 +1,63 @@
+"""The weights that a run keeps: its checkpoint, those that did best in validation, and how they are loaded."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from safetensors import SafetensorError, safe_open
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.training.checkpoint import fitting, load_checkpoint
+
+if TYPE_CHECKING:
+    from fb3d_rl.config import TrainConfig
+
+CHECKPOINT = "checkpoint.pt"
+
+BEST = "best.safetensors"
+"""The weights of the run that did best in validation."""
+
+
+def state_before(cfg: TrainConfig, out: Path) -> dict[str, Any] | None:
+    """The checkpoint to go on from. A run that ended before its first one has lost nothing: it begins anew."""
+    path = out / CHECKPOINT
+    return load_checkpoint(path, algo=cfg.algo.name) if cfg.resume and path.exists() else None
+
+
+def best_cosine(path: Path) -> float:
+    """Validation cosine of the weights in the file; -inf if there is none.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    if not path.is_file():
+        return -math.inf
+    try:
+        with safe_open(path, framework="pt") as content:
+            return float(content.metadata()["val/cosine"])
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged ({type(error).__name__}): copy it anew, or delete it") from error
+
+
+def load_trained(path: str | Path, network: type[CloudNetwork]) -> CloudNetwork:
+    """The network of a checkpoint that its algorithm wrote or of a .safetensors file, or the ArtFlowNet "pretrained".
+
+    Raises:
+        UserError: the file is missing or no such checkpoint.
+    """
+    if Path(path).suffix == ".safetensors" or (str(path) == "pretrained" and network is ArtFlowNet):
+        return network.from_pretrained(path)
+    content = load_checkpoint(path, algo=network.NAME)
+    with fitting(path):
+        net = network(**content["model_kwargs"])
+        net.load_state_dict(content["state"].get("average") or content["state"]["model"])
+    return net.eval()
+
+
+def load_network(path: str | Path) -> ArtFlowNet:
+    """:func:`load_trained` of an ArtFlowNet."""
+    return cast(ArtFlowNet, load_trained(path, ArtFlowNet))

@@ -1,0 +1,51 @@
+"""Options of flow samples and of the data sets that are made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fb3d_rl.camera.options import CameraOptions
+from fb3d_rl.camera.views import ViewRange
+from fb3d_rl.options import option
+
+
+@dataclass(frozen=True)
+class SampleOptions:
+    """How flow samples are drawn: from where (``views``) and with which optics (``camera``), and what moves in them."""
+
+    points: int = option(1200, "N, points of a cloud", within="[64, inf)")
+    views: ViewRange = ViewRange()
+    camera: CameraOptions = CameraOptions()
+    closed_share: float = option(
+        0.3,
+        "share of samples whose target part is exactly closed; the others are uniform over its range",
+        within="[0, 1]",
+    )
+    others_closed: float = option(
+        0.7, "probability that each other joint is closed rather than uniform over its range", within="[0, 1]"
+    )
+    all_parts_share: float = option(
+        0.3,
+        "share of samples whose target is all movable parts (the reference's target), mask included",
+        within="[0, 1]",
+    )
+    some_parts_share: float = option(
+        0.0, "share of samples whose target is a part and a random choice of the other movable ones", within="[0, 1]"
+    )
+
+
+@dataclass(frozen=True)
+class DataOptions(SampleOptions):
+    """Flow samples, the data sets that are made of them, and the expert's labels."""
+
+    train_samples: int = option(4000, "samples to train flow networks on")
+    dataset: str | None = option(None, "the folder samples/ of another run, to train on what it drew; null draws anew")
+    met_by: str | None = option(
+        None,
+        "an ArtFlowNet (checkpoint.pt, .safetensors) whose policy runs trials with the training objects; what it sees "
+        "there is trained on, too",
+    )
+    met_samples: int = option(2000, "how many such clouds")
+    labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds")
+    eval_samples: int = option(8, "samples of each held-out object on which the flow is measured", within="[1, inf)")
+    workers: int | None = option(None, "worker processes that draw samples; null: one per core", within="[0, inf)")

@@ -1,0 +1,200 @@
+"""An object as the simulator has it: built from what was read of it, with collision shapes that PhysX can simulate."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sapien
+from numpy.typing import NDArray
+from sapien.physx import (
+    PhysxArticulationLinkComponent,
+    PhysxCollisionShapeConvexMesh,
+    PhysxCollisionShapeTriangleMesh,
+    PhysxRigidStaticComponent,
+    get_default_material,
+)
+
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Mesh
+from fb3d_rl.assets.gripper import gripper_meshes
+from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.scene.posed import Posed
+
+if TYPE_CHECKING:
+    from mani_skill.envs.scene import ManiSkillScene
+    from mani_skill.utils.structs import Articulation
+
+OBJECT_BIT = 30
+"""Bit of collision group 2 that the object's links and the ground share, so that they do not collide.
+
+Parts of real objects overlap at rest and hulls overlap even more, so contact among them would jam every joint; and
+an object that stands on the ground would rub on it. The gripper has no such bit: it touches all of them.
+"""
+
+
+PLATE = 0.002
+"""Thickness (m) of what PhysX cannot make a body of; it makes flat panes as thick by itself."""
+
+
+def add_ground(scene: ManiSkillScene) -> None:
+    """Add the plane z = 0, which the object does not rub on."""
+    ground = scene.create_actor_builder()
+    ground.add_plane_collision(sapien.Pose(q=[0.7071068, 0, -0.7071068, 0]))
+    ground.collision_groups[2] |= 1 << OBJECT_BIT
+    ground.initial_pose = sapien.Pose()
+    ground.build_static(name="ground")
+
+
+class Model(Posed):
+    """What is computed of an object once, however often it is built into a scene.
+
+    Its further bodies are the gripper's: hand, left and right finger, each in its own frame.
+
+    Args:
+        obj: the object.
+        options: the task's constants.
+    """
+
+    def __init__(self, obj: ArticulatedObject, options: EnvOptions) -> None:
+        super().__init__(obj, options.camera, gripper_meshes())
+        self._options = options
+
+    @cached_property
+    def shapes(self) -> list[list[Any]]:
+        """Collision shapes of each link [L], cooked once: making them anew takes longer than the rest of a reset.
+
+        What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
+        move as both sides of their surface, placed in the world: a hull would close hollow bodies.
+        """
+        moves = self.tree.descendants.any(0).tolist()
+        poses = self.poses(np.zeros(len(self.obj.movable)))
+        shapes: list[list[Any]] = []
+        for link, pose, moving in zip(self.obj.links, poses, moves, strict=True):
+            shapes.append([])
+            for mesh in link.collisions:
+                if moving:
+                    shape = _hull(mesh)
+                    shape.set_density(self._options.density)
+                else:
+                    shape = _surface(mesh)
+                    shape.local_pose = sapien.Pose(pose)
+                shape.set_collision_groups([1, 1, 1 << OBJECT_BIT, 0])
+                shapes[-1].append(shape)
+        return shapes
+
+    def build(self, scene: ManiSkillScene, e: int) -> Articulation:
+        """Build the object in environment ``e``.
+
+        It is built from what was read of it: its files are from strangers and are not parsed a second time.
+        """
+        obj, o = self.obj, self._options
+        builder = scene.create_articulation_builder()
+        builder.set_scene_idxs([e])
+        builder.initial_pose = sapien.Pose(self.T_world_base)
+        links: list[Any] = []
+        for link in obj.links:
+            links.append(builder.create_link_builder(links[link.parent] if link.joint is not None else None))
+            links[-1].set_name(link.name)
+            if link.joint is None:
+                links[-1].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
+                continue
+            links[-1].set_joint_name(link.joint.name)
+            axis = sapien.Pose(_axis_frame(link.joint))
+            # SAPIEN calls a hinge with limits "revolute_unwrapped" and one that turns on and on "revolute".
+            kinds = {"revolute": "revolute_unwrapped", "continuous": "revolute"}
+            links[-1].set_joint_properties(
+                kinds.get(link.joint.type, link.joint.type),
+                [list(link.joint.limits)] if link.joint.movable else [],
+                sapien.Pose(link.joint.origin) * axis,
+                axis,
+            )
+        articulation: Articulation = builder.build(name=f"object-{e}", fix_root_link=True)
+        for joint in articulation.active_joints:
+            joint.set_friction(o.joint_friction)
+            joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
+        return articulation
+
+    def add_shapes(self, links: Sequence[PhysxArticulationLinkComponent]) -> PhysxRigidStaticComponent:
+        """Give the links their shapes; the result has those of what does not move.
+
+        Only a static body can have a surface as its shape.
+        """
+        static = PhysxRigidStaticComponent()
+        moves = self.tree.descendants.any(0).tolist()
+        for component, shapes, moving in zip(links, self.shapes, moves, strict=True):
+            for shape in shapes:
+                (component if moving else static).attach(shape)
+        return static
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """PhysX' complaints about meshes that are mended."""
+    sapien.set_log_level("off")
+    try:
+        yield
+    finally:
+        sapien.set_log_level("warn")  # SAPIEN's default; there is no way to ask for the present one
+
+
+def _hull(mesh: Mesh) -> PhysxCollisionShapeConvexMesh:
+    """The mesh's convex hull; a plate where that has no volume, such as that of a triangle."""
+    # From points (not from the file) PhysX makes a thin plate of most flat meshes, such as a pane of glass.
+    try:
+        with _quiet():
+            return PhysxCollisionShapeConvexMesh(mesh.vertices.astype(np.float32), [1.0] * 3, get_default_material())
+    except RuntimeError:
+        return PhysxCollisionShapeConvexMesh(_plate(mesh.vertices), [1.0] * 3, get_default_material())
+
+
+def _surface(mesh: Mesh) -> PhysxCollisionShapeTriangleMesh | PhysxCollisionShapeConvexMesh:
+    """The mesh's surface; a plate where that is too thin for PhysX to have any.
+
+    For PhysX a triangle has one side, while real meshes look either way or are open sheets.
+    """
+    faces = np.concatenate([mesh.faces, _other_sides(mesh)]).astype(np.uint32)
+    try:
+        with _quiet():
+            return PhysxCollisionShapeTriangleMesh(
+                mesh.vertices.astype(np.float32), faces, [1.0] * 3, get_default_material()
+            )
+    except RuntimeError:
+        return _hull(mesh)
+
+
+def _other_sides(mesh: Mesh) -> NDArray[np.int64]:
+    """The faces [F, 3] turned over, without those that the mesh holds already, as many of the dataset's do."""
+    number = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)[1].reshape(-1)
+
+    def keys(faces: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Faces by their corners' places, the lowest first: the same for the same side of the same triangle."""
+        places = number[faces]
+        first = places.argmin(1)[:, None]
+        in_turn: NDArray[np.int64] = np.take_along_axis(places, (first + np.arange(3)) % 3, axis=1)
+        return in_turn @ np.array([len(number) ** 2, len(number), 1])
+
+    turned = mesh.faces[:, ::-1]
+    return turned[~np.isin(keys(turned), keys(mesh.faces))]
+
+
+def _plate(vertices: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Points [8 V, 3] whose hull is that of ``vertices`` [V, 3], grown to ``PLATE`` along axes where it is thinner."""
+    spread = vertices - vertices.mean(0)
+    axes = np.linalg.eigh(spread.T @ spread)[1].T
+    lacks = np.maximum(PLATE - np.ptp(spread @ axes.T, axis=0), 0.0)
+    grown = 0.5 * np.array(list(itertools.product((-1, 1), repeat=3))) * lacks @ axes
+    return (vertices[:, None] + grown).reshape(-1, 3).astype(np.float32)
+
+
+def _axis_frame(joint: Joint) -> NDArray[np.float64]:
+    """T_joint_axis [4, 4] whose x axis is the joint's axis: PhysX's joints move along or about x."""
+    frame = np.eye(4)
+    if joint.movable:
+        y = np.cross(joint.axis, np.eye(3)[np.abs(joint.axis).argmin()])
+        y /= np.linalg.norm(y)
+        frame[:3, :3] = np.stack([joint.axis, y, np.cross(joint.axis, y)], axis=1)
+    return frame

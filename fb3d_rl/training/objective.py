@@ -1,0 +1,42 @@
+"""What a fit minimizes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from fb3d_rl.training.device import products_of
+from fb3d_rl.training.draws import augment
+from fb3d_rl.training.options import FitOptions
+
+Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
+"""The loss of a batch of rows [B] in step number k, a scalar."""
+
+
+def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """L2 loss (supplement, II.A): squared norm of the error [B, N, 3], mean over all valid [B, N] points of
+    the batch.
+
+    Static points count too: the network must learn what does not move.
+    """
+    squared = (predicted - target).square().sum(2).masked_fill(~valid, 0.0)
+    return squared.sum() / valid.sum().clamp(min=1)
+
+
+def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
+    """:func:`flow_loss` of a flow network on clouds that are augmented according to the options.
+
+    ``share`` is the part of the whole batch that the objective is called with.
+    """
+
+    def objective(batch: TensorDictBase, step: int) -> Tensor:
+        batch = augment(batch, options, step, share)
+        points, valid = batch["observation", "points"], batch["observation", "valid"]
+        with products_of(options, points.device):
+            predicted = model(points, valid, batch["observation", "part_mask"])
+        return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
+
+    return objective
