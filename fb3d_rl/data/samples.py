@@ -20,7 +20,7 @@ def flow_sample(cloud: Cloud, *targets: int) -> TensorDict:
     return TensorDict(
         {
             "observation": {key: truth[key] for key in ("points", "valid", "part_mask")},
-            "privileged": {"flow": truth["flow"]},
+            "privileged": {"flow": truth["flow"], "link": truth["link"].to(torch.int16)},
             "target": torch.tensor(targets[0] if len(targets) == 1 else -1),
         },
         batch_size=[],

@@ -74,18 +74,22 @@ class ArtFlowNet(CloudNetwork):
     ) -> None:
         self.hypotheses = hypotheses
         super().__init__(part_mask_input, neighbors, backbone, generator)
-        if hypotheses > 1:
-            self.arguments["hypotheses"] = hypotheses
+        self.arguments["hypotheses"] = hypotheses
 
     def outputs(self) -> int:
         """Of each hypothesis a flow, and a score if there are several."""
         return self.OUTPUTS if self.hypotheses == 1 else (self.OUTPUTS + 1) * self.hypotheses
 
-    def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Tensor:
-        """See the class."""
+    def forward(
+        self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None, propose: bool = False
+    ) -> Tensor | Hypotheses:
+        """See the class; with ``propose`` all hypotheses."""
+        output = self.per_point(points, valid, part_mask)
+        if propose:
+            return self.hypotheses_of(output)
         if self.hypotheses == 1:
-            return self.per_point(points, valid, part_mask)
-        return self.most_probable(self.propose(points, valid, part_mask), valid, part_mask)
+            return output
+        return self.most_probable(self.hypotheses_of(output), valid, part_mask)
 
     def propose(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Hypotheses:
         """All hypotheses for clouds as of the class."""

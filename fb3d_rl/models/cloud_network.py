@@ -53,7 +53,11 @@ class CloudNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.part_mask_input = part_mask_input
-        self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors, "backbone": backbone}
+        self.arguments: dict[str, bool | int | str] = {
+            "part_mask_input": part_mask_input,
+            "neighbors": neighbors,
+            "backbone": backbone,
+        }
         self.network = BACKBONES[backbone](inputs=int(part_mask_input), outputs=self.outputs(), neighbors=neighbors)
         self.add_layers()
         if generator is not None:

@@ -9,12 +9,10 @@ which one wins.
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from fb3d_rl.flow.metrics import MOVING_NORM
-from fb3d_rl.models.artflownet import ArtFlowNet, Hypotheses
-from fb3d_rl.training.fit import FitOptions, Objective, augment, products_of
+from fb3d_rl.models.artflownet import Hypotheses
 
 RELAXATION = 0.05
 """Share of the loss that the hypotheses which do not win have together."""
@@ -33,7 +31,7 @@ def hypotheses_loss(found: Hypotheses, target: Tensor, valid: Tensor, link: Tens
         link: [B, N] int, the link that a point lies on: those of a link have one motion.
 
     Returns:
-        A scalar; for one hypothesis it is :func:`fb3d_rl.training.fit.flow_loss`.
+        A scalar; for one hypothesis it is :func:`fb3d_rl.training.objective.flow_loss`.
     """
     flows, log_probabilities = found
     count = flows.shape[1]
@@ -52,21 +50,3 @@ def hypotheses_loss(found: Hypotheses, target: Tensor, valid: Tensor, link: Tens
     flow_error = (still + (weights * errors).sum()) / valid.sum().clamp(min=1)
     scores = log_probabilities.transpose(1, 2)[moving].gather(1, winner[part][:, None])
     return flow_error - SCORE_WEIGHT * scores.sum() / moving.sum().clamp(min=1)
-
-
-def hypotheses_objective(model: ArtFlowNet, options: FitOptions, share: slice = slice(None)) -> Objective:
-    """:func:`hypotheses_loss` of a flow network on clouds that are augmented as the options say.
-
-    ``share`` is the part of the whole batch that the objective is given.
-    """
-
-    def objective(batch: TensorDictBase, step: int) -> Tensor:
-        link = batch["privileged", "link"]
-        batch = augment(batch, options, step, share)
-        points, valid = batch["observation", "points"], batch["observation", "valid"]
-        with products_of(options, points.device):
-            found = model.propose(points, valid, batch["observation", "part_mask"])
-        found = Hypotheses(found.flows.float(), found.log_probabilities.float())
-        return hypotheses_loss(found, batch["privileged", "flow"], valid, link)
-
-    return objective

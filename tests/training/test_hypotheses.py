@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from fb3d_rl.models.artflownet import Hypotheses
-from fb3d_rl.training.fit import flow_loss
 from fb3d_rl.training.hypotheses import RELAXATION, SCORE_WEIGHT, hypotheses_loss
+from fb3d_rl.training.objective import flow_loss
 
 
 def drawn(hypotheses: int) -> tuple[Hypotheses, torch.Tensor, torch.Tensor, torch.Tensor]:
