@@ -196,7 +196,7 @@ def test_a_trajectory_file_that_record_episode_wrote_is_read(
     maniskill.write(read, tmp_path / "z.h5")  # its file says nothing about the task, and can be written again
     (info,) = read.episodes
     assert (info.steps, info.success) == (buffer.episodes[1].steps, buffer.episodes[1].success)
-    with pytest.raises(UserError, match="from elsewhere"):
+    with pytest.raises(UserError, match="from another source"):
         trial_of(info)
     with pytest.raises(UserError, match="does not say how"):
         recorded_options(read)
