@@ -73,6 +73,7 @@ GROUPS["sample"] = {
         ("privileged", "flow"),
     )
 }
+GROUPS["sample"]["privileged", "link"] = Entry(("N",), torch.int16, "the link that a point lies on, -1 on padding")
 
 
 def spec(group: str) -> dict[Key, Entry]:

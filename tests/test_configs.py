@@ -47,13 +47,14 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "assets/mixed"): ["assets.root=."],
     ("train", "experiment/comparison_partnet"): ["assets.root=."],
     ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
+    ("train", "experiment/partnet_long"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/ump_di"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/dagger"): ["checkpoint=checkpoint.pt"],
 }
-TRAINING_ONLY = {"experiment/partnet"}
+TRAINING_ONLY = {"experiment/partnet_long", "experiment/partnet"}
 
 
 @pytest.fixture(autouse=True)

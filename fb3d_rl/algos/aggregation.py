@@ -34,6 +34,7 @@ EVERY = 0.2
 KEYS: tuple[Key, ...] = (
     *(("observation", key) for key in ("points", "valid", "part_mask")),
     ("privileged", "flow"),
+    ("privileged", "link"),
 )
 
 
@@ -91,7 +92,11 @@ def meet_samples(
                 part = slice(filled, filled + len(seen))
                 owner, size = number[trial.object], [len(seen)]
                 rows[part] = seen.select(*KEYS).update(
-                    {"target": torch.full(size, trial.link), "object": torch.full(size, owner)}
+                    {
+                        ("privileged", "link"): seen["privileged", "link"].to(torch.int16),
+                        "target": torch.full(size, trial.link),
+                        "object": torch.full(size, owner),
+                    }
                 )
                 filled = part.stop
             if barren >= BARREN and filled < count:

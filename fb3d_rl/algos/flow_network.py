@@ -262,15 +262,20 @@ def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
     """The network to train: its weights depend on the seed alone, or are those of ``algo.start_from``.
 
     Raises:
-        UserError: these are another network's.
+        UserError: these are another network's, or it cannot propose several flows.
     """
     algo = cast("FlowNetworkOptions", cfg.algo)
     generator = torch.Generator().manual_seed(cfg.seed)
-    net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator)
+    if algo.hypotheses > 1 and kind.network is not ArtFlowNet:
+        raise UserError(f"algo={algo.name} proposes one answer: leave algo.hypotheses=1")
+    further = {"hypotheses": algo.hypotheses} if kind.network is ArtFlowNet else {}
+    net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator, **further)
     if algo.start_from:
         begun = load_trained(algo.start_from, kind.network)
         if begun.arguments != net.arguments:
-            different = [f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments[key] != value]
+            different = [
+                f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments.get(key) != value
+            ]
             raise UserError(f"algo.start_from={algo.start_from} is another network; give {' '.join(different)}")
         net.load_state_dict(begun.state_dict())
     return net

@@ -31,6 +31,12 @@ class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
     backbone: Literal["pointnet2", "delayed"] = option("pointnet2", "the paper's, or one that is several times as fast")
     neighbors: int = option(64, "points kept in a ball", within="[1, inf)")
     part_mask_input: bool = option(True, "whether the network sees which points are on the part to open")
+    hypotheses: int = option(
+        1,
+        "flows that ArtFlowNet proposes for each cloud, each with a probability: sight alone does not tell which way a "
+        "closed lid or a lever goes; 1 is the paper's",
+        within="[1, inf)",
+    )
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def generate_samples(
         "count": count,
         "seed": seed,
         "options": asdict(options),
-        "version": 2,
+        "version": 3,
     }
     done = finished_rows(out, recipe)
     if done is not None:
@@ -200,7 +200,7 @@ def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:
                 "valid": torch.zeros(points, dtype=torch.bool),
                 "part_mask": torch.zeros(points, dtype=torch.bool),
             },
-            "privileged": {"flow": torch.zeros(points, 3)},
+            "privileged": {"flow": torch.zeros(points, 3), "link": torch.zeros(points, dtype=torch.int16)},
             "target": torch.zeros((), dtype=torch.int64),
             "object": torch.zeros((), dtype=torch.int64),
         },

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import ViewRange
+from fb3d_rl.errors import UserError
 from fb3d_rl.options import option
 
 
@@ -32,6 +33,24 @@ class SampleOptions:
     some_parts_share: float = option(
         0.0, "share of samples whose target is a part and a random choice of the other movable ones", within="[0, 1]"
     )
+    unmasked_share: float = option(
+        0.0,
+        "share of samples whose target is all movable parts and whose mask marks every point: it says nothing, as "
+        "where there is none",
+        within="[0, 1]",
+    )
+
+    def __post_init__(self) -> None:
+        """Check the shares together.
+
+        Raises:
+            UserError: they add up to more than 1.
+        """
+        together = self.all_parts_share + self.some_parts_share + self.unmasked_share
+        if together > 1.0:
+            raise UserError(
+                f"data.all_parts_share, some_parts_share and unmasked_share add up to {together:g}: give 1 at most"
+            )
 
 
 @dataclass(frozen=True)

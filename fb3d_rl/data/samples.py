@@ -11,16 +11,18 @@ from fb3d_rl.scene.observer import TRIES, Cloud, observe
 from fb3d_rl.scene.posed import Posed
 
 
-def flow_sample(cloud: Cloud, *targets: int) -> TensorDict:
+def flow_sample(cloud: Cloud, *targets: int, masked: bool = True) -> TensorDict:
     """The sample (contract group "sample") of a cloud whose targets are these links, or all movable parts.
 
-    Its "target" is the link if it is one, else -1.
+    Its "target" is the link if it is one, else -1. If it is not ``masked``, the mask marks every point.
     """
     truth = cloud.with_truth(cloud.posed.direction(*targets))
+    if not masked:
+        truth["part_mask"] = truth["valid"]
     return TensorDict(
         {
             "observation": {key: truth[key] for key in ("points", "valid", "part_mask")},
-            "privileged": {"flow": truth["flow"]},
+            "privileged": {"flow": truth["flow"], "link": truth["link"].to(torch.int16)},
             "target": torch.tensor(targets[0] if len(targets) == 1 else -1),
         },
         batch_size=[],
@@ -38,8 +40,9 @@ def draw_sample(posed: Posed, options: SampleOptions, rng: np.random.Generator) 
         cloud = observe(posed, poses, options.views.sample(rng), options.points, rng)
         share = rng.random()
         if cloud.shows(link):
-            targets: tuple[int, ...] = (link,) if share >= options.all_parts_share else ()
+            masked = share < 1.0 - options.unmasked_share
+            targets: tuple[int, ...] = (link,) if masked and share >= options.all_parts_share else ()
             if targets and share < options.all_parts_share + options.some_parts_share:
                 targets += tuple(other for other in movable if other != link and rng.random() < 0.5)
-            return flow_sample(cloud, *targets)
+            return flow_sample(cloud, *targets, masked=masked)
     return None

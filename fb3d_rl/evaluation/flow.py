@@ -43,7 +43,7 @@ def held_out_samples(
         if not posed.openable:
             continue
         for target in targets:
-            wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0)
+            wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0, unmasked_share=0.0)
             for number in range(count):
                 rng = np.random.default_rng([seed, 4, zlib.crc32(obj.id.encode()), number])
                 sample = draw_sample(posed, wanted, rng)

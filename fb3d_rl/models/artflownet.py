@@ -4,8 +4,9 @@ supplement, II.A).
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -26,27 +27,95 @@ PRETRAINED = folder("pretrained") / "artflownet.safetensors"
 """The weights that this project publishes."""
 
 
+class Hypotheses(NamedTuple):
+    """K possible flows of each cloud, since sight alone does not tell which way a closed lid or a lever goes.
+
+    Attributes:
+        flows: [B, K, N, 3] f32, world axes; 0 on invalid points.
+        log_probabilities: [B, K, N] f32, of the hypotheses at each point; their exponentials add up to 1 over K.
+    """
+
+    flows: Tensor
+    log_probabilities: Tensor
+
+    def of_clouds(self, points: Tensor) -> Tensor:
+        """Probabilities [B, K] of the hypotheses for ``points`` [B, N] (bool) as a whole, such as those of a part.
+
+        All points of a part move by one hypothesis: its log-probability is the mean of theirs, up to a constant.
+        """
+        count = points.sum(1).clamp(min=1)[:, None]
+        return (self.log_probabilities.masked_fill(~points[:, None], 0.0).sum(2) / count).softmax(1)
+
+
 class ArtFlowNet(CloudNetwork):
     """Predict 3D articulation flow with a PointNet++.
 
-    Args: as of :class:`CloudNetwork`.
+    Args:
+        part_mask_input, neighbors, backbone, generator: as of :class:`CloudNetwork`.
+        hypotheses: K, how many flows it proposes for each cloud, each with a probability; with 1 it is the paper's.
 
     Shapes:
         points [B, N, 3] f32, m, world axes; valid [B, N] bool; part_mask [B, N] bool -> flow [B, N, 3] f32,
         world axes, trained towards a largest norm of 1 in a cloud; 0 on invalid points. A network that was
-        trained without part_mask does not read it.
+        trained without part_mask does not read it. With several hypotheses it is the most probable one: of the part if
+        the network reads the mask, else of each point.
     """
 
     NAME = "artflownet"
     OUTPUTS = 3
 
-    def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Tensor:
-        """See the class."""
-        return self.per_point(points, valid, part_mask)
+    def __init__(
+        self,
+        part_mask_input: bool = True,
+        neighbors: int = 64,
+        backbone: str = "pointnet2",
+        generator: torch.Generator | None = None,
+        hypotheses: int = 1,
+    ) -> None:
+        self.hypotheses = hypotheses
+        super().__init__(part_mask_input, neighbors, backbone, generator)
+        self.arguments["hypotheses"] = hypotheses
+
+    def outputs(self) -> int:
+        """Of each hypothesis a flow, and a score if there are several."""
+        return self.OUTPUTS if self.hypotheses == 1 else (self.OUTPUTS + 1) * self.hypotheses
+
+    def forward(
+        self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None, propose: bool = False
+    ) -> Tensor | Hypotheses:
+        """See the class; with ``propose`` all hypotheses."""
+        output = self.per_point(points, valid, part_mask)
+        if propose:
+            return self.hypotheses_of(output)
+        if self.hypotheses == 1:
+            return output
+        return self.most_probable(self.hypotheses_of(output), valid, part_mask)
+
+    def propose(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Hypotheses:
+        """All hypotheses for clouds as of the class."""
+        return self.hypotheses_of(self.per_point(points, valid, part_mask))
+
+    def hypotheses_of(self, output: Tensor) -> Hypotheses:
+        """What :meth:`per_point` yields [B, N, outputs], read as hypotheses."""
+        if self.hypotheses == 1:
+            return Hypotheses(output[:, None], output.new_zeros(len(output), 1, output.shape[1]))
+        flows, scores = output.split([self.OUTPUTS * self.hypotheses, self.hypotheses], 2)
+        flows = flows.unflatten(2, (self.hypotheses, self.OUTPUTS)).transpose(1, 2)
+        return Hypotheses(flows, scores.float().log_softmax(2).transpose(1, 2))
+
+    def most_probable(self, found: Hypotheses, valid: Tensor, part_mask: Tensor | None) -> Tensor:
+        """The flow [B, N, 3] of the most probable hypothesis, see the class."""
+        if self.part_mask_input:
+            assert part_mask is not None
+            best = found.of_clouds(part_mask & valid).argmax(1)[:, None].expand_as(valid)
+        else:
+            best = found.log_probabilities.argmax(1)
+        places = best[:, None, :, None].expand(-1, 1, -1, self.OUTPUTS)
+        return found.flows.gather(1, places).squeeze(1)
 
     @torch.no_grad()
     def predict(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None = None) -> Cloud:
-        """The flow of a cloud of any size, in evaluation mode.
+        """The flow of a cloud of any size, in evaluation mode; of several hypotheses the most probable.
 
         A cloud of more than 1200 points is dealt out at random (always alike) into clouds of at most as many, and each
         point's flow is the one that its own gets.
@@ -61,6 +130,40 @@ class ArtFlowNet(CloudNetwork):
         Raises:
             UserError: a shape is another, or the mask is missing.
         """
+        cloud, mask = self._checked(points, part_mask)
+        flows, probabilities = self._dealt(cloud, mask)
+        if self.hypotheses == 1:
+            flow = flows[0]
+        else:
+            valid = cloud.isfinite().all(1)
+            flow = self.most_probable(Hypotheses(flows[None], probabilities[None]), valid[None], mask[None])[0]
+        return _as_given(flow, points)
+
+    @torch.no_grad()
+    def predict_all(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None = None) -> tuple[Cloud, Cloud]:
+        """All hypotheses for a cloud of any size, the most probable first.
+
+        Args:
+            points: as of :meth:`predict`.
+            part_mask: as of :meth:`predict`. With a mask the probabilities are those of the marked part, else of all
+                points that are predicted to move (flow above a tenth).
+
+        Returns:
+            Flows [K, N, 3] and their probabilities [K], which add up to 1.
+
+        Raises:
+            UserError: as :meth:`predict`.
+        """
+        cloud, mask = self._checked(points, part_mask)
+        flows, log_probabilities = self._dealt(cloud, mask)
+        about = mask if part_mask is not None else (flows.norm(dim=2) > 0.1).any(0)
+        about = about & cloud.isfinite().all(1)
+        probabilities = Hypotheses(flows[None], log_probabilities[None]).of_clouds(about[None])[0]
+        order = probabilities.argsort(descending=True, stable=True)
+        return _as_given(flows[order], points), _as_given(probabilities[order], points)
+
+    def _checked(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None) -> tuple[Tensor, Tensor]:
+        """The cloud [N, 3] f32 and the mask [N] on the network's device."""
         cloud = torch.as_tensor(points)
         if cloud.ndim != 2 or cloud.shape[1] != 3 or not cloud.is_floating_point():
             raise UserError(f"The cloud is {cloud.dtype} {list(cloud.shape)}: give floats [N, 3].")
@@ -71,34 +174,45 @@ class ArtFlowNet(CloudNetwork):
         if mask.shape != (count,):
             raise UserError(f"The mask is {list(mask.shape)} for {count} points: give [N] bool.")
         device = next(self.parameters()).device
-        cloud, mask = cloud.to(device, torch.float32), mask.to(device, torch.bool)
+        return cloud.to(device, torch.float32), mask.to(device, torch.bool)
+
+    def _dealt(self, cloud: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """Flows [K, N, 3] and log-probabilities [K, N] of a cloud of any size, dealt out into clouds of POINTS."""
         valid = cloud.isfinite().all(1)
-        flow = torch.zeros_like(cloud)
+        flows = cloud.new_zeros(self.hypotheses, len(cloud), 3)
+        log_probabilities = cloud.new_full((self.hypotheses, len(cloud)), -math.log(self.hypotheses))
         rows = valid.nonzero().flatten()
-        if len(rows):
-            clouds = -(-len(rows) // POINTS)
-            size = -(-len(rows) // clouds)
-            dealt = rows
-            if clouds > 1:
-                dealt = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0)).to(device)]
-            # Filled up to whole clouds with padding.
-            places = torch.nn.functional.pad(dealt, (0, clouds * size - len(rows))).view(clouds, size)
-            real = torch.arange(clouds * size, device=device).view(clouds, size) < len(rows)
-            training = self.training
-            self.eval()
-            try:
-                found = self(cloud[places], real, mask[places] & real)
-            finally:
-                self.train(training)
-            flow[places[real]] = found[real]
-        if isinstance(points, Tensor):
-            return flow.to(points.device)
-        return flow.cpu().numpy()
+        if not len(rows):
+            return flows, log_probabilities
+        clouds = -(-len(rows) // POINTS)
+        size = -(-len(rows) // clouds)
+        dealt = rows
+        if clouds > 1:
+            dealt = rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0)).to(cloud.device)]
+        # Filled up to whole clouds with padding.
+        places = torch.nn.functional.pad(dealt, (0, clouds * size - len(rows))).view(clouds, size)
+        real = torch.arange(clouds * size, device=cloud.device).view(clouds, size) < len(rows)
+        training = self.training
+        self.eval()
+        try:
+            found = self.propose(cloud[places], real, mask[places] & real)
+        finally:
+            self.train(training)
+        flows[:, places[real]] = found.flows.transpose(0, 1)[:, real]
+        log_probabilities[:, places[real]] = found.log_probabilities.transpose(0, 1)[:, real]
+        return flows, log_probabilities
 
     @classmethod
     def from_pretrained(cls, path: str | Path = "pretrained") -> ArtFlowNet:
         """As :meth:`CloudNetwork.from_pretrained`; "pretrained" is the network that this project publishes."""
         return super().from_pretrained(PRETRAINED if str(path) == "pretrained" else path)
+
+
+def _as_given(found: Tensor, points: Cloud) -> Cloud:
+    """``found`` of the kind of ``points``, and on its device."""
+    if isinstance(points, Tensor):
+        return found.to(points.device)
+    return found.cpu().numpy()
 
 
 def reads_mask(net: nn.Module) -> bool:
@@ -108,7 +222,7 @@ def reads_mask(net: nn.Module) -> bool:
 
 def artflownet_module(net: nn.Module) -> TensorDictModule:
     """Read the observation's points, valid and, if the network was trained with it, part_mask; write ("prediction",
-    "flow"), what the network answers.
+    "flow"), what the network answers; of several hypotheses the most probable.
     """
     keys = [("observation", key) for key in ("points", "valid", *(["part_mask"] if reads_mask(net) else []))]
     return TensorDictModule(net, in_keys=keys, out_keys=[("prediction", "flow")])

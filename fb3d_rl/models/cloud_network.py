@@ -53,11 +53,19 @@ class CloudNetwork(nn.Module):
     ) -> None:
         super().__init__()
         self.part_mask_input = part_mask_input
-        self.arguments = {"part_mask_input": part_mask_input, "neighbors": neighbors, "backbone": backbone}
-        self.network = BACKBONES[backbone](inputs=int(part_mask_input), outputs=self.OUTPUTS, neighbors=neighbors)
+        self.arguments: dict[str, bool | int | str] = {
+            "part_mask_input": part_mask_input,
+            "neighbors": neighbors,
+            "backbone": backbone,
+        }
+        self.network = BACKBONES[backbone](inputs=int(part_mask_input), outputs=self.outputs(), neighbors=neighbors)
         self.add_layers()
         if generator is not None:
             initialize(self, generator)
+
+    def outputs(self) -> int:
+        """How many numbers the PointNet++ yields for each point."""
+        return self.OUTPUTS
 
     def add_layers(self) -> None:
         """Make what a network has beside its PointNet++: nothing, here."""

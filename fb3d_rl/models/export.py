@@ -45,8 +45,11 @@ class DenseArtFlowNet(nn.Module):
         rows = _propagate(network.fp1, fine, points1, own, points)
         dense, last = network.head
         assert isinstance(dense, DenseMLP)
-        flow: Tensor = last(_layers(dense, rows))
-        return flow
+        output: Tensor = last(_layers(dense, rows))
+        if self.net.hypotheses == 1:
+            return output
+        every = torch.ones_like(part_mask)
+        return self.net.most_probable(self.net.hypotheses_of(output), every, part_mask)
 
 
 def export(net: ArtFlowNet, path: Path, points: int) -> None:

@@ -7,9 +7,12 @@ from typing import TypeAlias
 
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
+from fb3d_rl.models.artflownet import Hypotheses
 from fb3d_rl.training.device import products_of
 from fb3d_rl.training.draws import augment
+from fb3d_rl.training.hypotheses import hypotheses_loss
 from fb3d_rl.training.options import FitOptions
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
@@ -27,16 +30,24 @@ def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
 
 
 def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
-    """:func:`flow_loss` of a flow network on clouds that are augmented according to the options.
+    """The loss of a flow network on clouds that are augmented according to the options.
 
-    ``share`` is the part of the whole batch that the objective is called with.
+    It is :func:`flow_loss`, and :func:`~fb3d_rl.training.hypotheses.hypotheses_loss` of a network that proposes several
+    flows. ``share`` is the part of the whole batch that the objective is called with.
     """
+    network = model.module if isinstance(model, DistributedDataParallel) else model
+    several = getattr(network, "hypotheses", 1) > 1
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
+        link = batch["privileged", "link"] if several else None
         batch = augment(batch, options, step, share)
         points, valid = batch["observation", "points"], batch["observation", "valid"]
+        inputs, target = (points, valid, batch["observation", "part_mask"]), batch["privileged", "flow"]
         with products_of(options, points.device):
-            predicted = model(points, valid, batch["observation", "part_mask"])
-        return flow_loss(predicted.float(), batch["privileged", "flow"], valid)
+            predicted = model(*inputs, propose=True) if several else model(*inputs)
+        if link is None:
+            return flow_loss(predicted.float(), target, valid)
+        found = Hypotheses(predicted.flows.float(), predicted.log_probabilities.float())
+        return hypotheses_loss(found, target, valid, link)
 
     return objective

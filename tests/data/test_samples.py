@@ -13,6 +13,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import View, ViewRange
 from fb3d_rl.data.samples import SampleOptions, draw_sample
+from fb3d_rl.errors import UserError
 from fb3d_rl.scene.observer import MIN_VISIBLE, observe
 from fb3d_rl.scene.posed import Posed
 
@@ -23,6 +24,27 @@ OPTIONS = SampleOptions(points=256, camera=CAMERA)
 @pytest.fixture(scope="module")
 def views(procedural_objects: dict[str, ArticulatedObject]) -> list[Posed]:
     return [Posed(obj, CAMERA) for obj in procedural_objects.values()]
+
+
+def test_unmasked_samples_mark_every_point_and_move_all_parts(views: list[Posed]) -> None:
+    """The other samples are what they are without the option."""
+    options = dataclasses.replace(OPTIONS, unmasked_share=0.5)
+    everything = dataclasses.replace(OPTIONS, all_parts_share=1.0)
+    found = {True: 0, False: 0}
+    for view in views:
+        for seed in range(8):
+            sample = draw_sample(view, options, np.random.default_rng(seed))
+            usual = draw_sample(view, OPTIONS, np.random.default_rng(seed))
+            every = draw_sample(view, everything, np.random.default_rng(seed))
+            assert sample is not None and usual is not None and every is not None
+            unmasked = torch.equal(sample["observation", "part_mask"], sample["observation", "valid"])
+            found[unmasked] += 1
+            like = every if unmasked else usual
+            assert torch.equal(sample["privileged", "flow"], like["privileged", "flow"])
+            assert unmasked or torch.equal(sample["observation", "part_mask"], usual["observation", "part_mask"])
+    assert min(found.values()) >= 4
+    with pytest.raises(UserError, match="unmasked_share"):
+        dataclasses.replace(OPTIONS, all_parts_share=0.6, unmasked_share=0.5)
 
 
 @pytest.mark.parametrize("all_parts", [0.0, 1.0])

@@ -20,9 +20,9 @@ Maker: TypeAlias = "Callable[..., ArtFlowNet]"
 def make_net(request: pytest.FixtureRequest) -> Maker:
     """Makes networks, of each kind, whose batch norms have seen data."""
 
-    def make(part_mask_input: bool = True, neighbors: int = 16) -> ArtFlowNet:
+    def make(part_mask_input: bool = True, neighbors: int = 16, hypotheses: int = 1) -> ArtFlowNet:
         generator = torch.Generator().manual_seed(0)
-        net = ArtFlowNet(part_mask_input, neighbors, request.param, generator)
+        net = ArtFlowNet(part_mask_input, neighbors, request.param, generator, hypotheses)
         for module in net.modules():
             if isinstance(module, torch.nn.BatchNorm1d):
                 module.momentum = 1.0  # take the statistics of one batch as they are
@@ -197,3 +197,45 @@ def test_damaged_weights_end_in_one_sentence(make_net: Maker, tmp_path: Path, da
         path.unlink()
     with pytest.raises(UserError, match=r"net\.safetensors"):
         ArtFlowNet.from_pretrained(path)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+def test_the_most_probable_of_several_hypotheses_is_the_answer(make_net: Maker, masked: bool) -> None:
+    net = make_net(part_mask_input=masked, hypotheses=3).eval()
+    points, valid, mask = make_batch()
+    found = net.propose(points, valid, mask)
+    assert found.flows.shape == (3, 3, 80, 3) and found.log_probabilities.shape == (3, 3, 80)
+    torch.testing.assert_close(found.log_probabilities.exp().sum(1), torch.ones(3, 80))
+    answer = net(points, valid, mask)
+    if masked:
+        best = (found.log_probabilities * mask[:, None]).sum(2).argmax(1)
+        assert torch.equal(answer, found.flows[torch.arange(3), best])
+    else:
+        best = found.log_probabilities.argmax(1)
+        for cloud in range(3):
+            for point in range(80):
+                assert torch.equal(answer[cloud, point], found.flows[cloud, best[cloud, point], point])
+    assert answer[~valid].abs().max() == 0
+
+
+def test_predict_all_orders_the_hypotheses_by_their_probability(make_net: Maker) -> None:
+    net = make_net(hypotheses=4).eval()
+    points, _, mask = make_batch()
+    flows, probabilities = net.predict_all(points[0].numpy(), mask[0].numpy())
+    assert isinstance(flows, np.ndarray) and flows.shape == (4, 80, 3) and probabilities.shape == (4,)
+    assert probabilities.sum() == pytest.approx(1.0, abs=1e-5) and (np.diff(probabilities) <= 0).all()
+    np.testing.assert_array_equal(flows[0], net.predict(points[0].numpy(), mask[0].numpy()))
+    large = torch.rand(3 * POINTS, 3)
+    flows, probabilities = net.predict_all(large, large[:, 2] > 0.5)
+    assert flows.shape == (4, 3 * POINTS, 3) and torch.equal(flows[0], net.predict(large, large[:, 2] > 0.5))
+    one = make_net()
+    flows, probabilities = one.predict_all(points[0], mask[0])
+    assert torch.equal(flows[0], one.predict(points[0], mask[0])) and probabilities.tolist() == [1.0]
+
+
+def test_hypotheses_are_kept_with_the_weights(make_net: Maker, tmp_path: Path) -> None:
+    net = make_net(hypotheses=3).eval()
+    net.save_pretrained(tmp_path / "net.safetensors")
+    points, valid, mask = make_batch()
+    again = ArtFlowNet.from_pretrained(tmp_path / "net.safetensors")
+    assert again.hypotheses == 3 and torch.equal(again(points, valid, mask), net(points, valid, mask))

@@ -13,10 +13,10 @@ from fb3d_rl.models.cloud_network import BACKBONES
 from fb3d_rl.models.export import DenseArtFlowNet, export
 
 
-def trained(part_mask_input: bool = True, backbone: str = "pointnet2") -> ArtFlowNet:
+def trained(part_mask_input: bool = True, backbone: str = "pointnet2", hypotheses: int = 1) -> ArtFlowNet:
     """A network whose batch norms have seen data, some with a negative scale, and whose flow is of the size of 1."""
     generator = torch.Generator().manual_seed(0)
-    net = ArtFlowNet(part_mask_input, neighbors=16, backbone=backbone, generator=generator)
+    net = ArtFlowNet(part_mask_input, neighbors=16, backbone=backbone, generator=generator, hypotheses=hypotheses)
     for module in net.modules():
         if isinstance(module, torch.nn.BatchNorm1d):
             with torch.no_grad():
@@ -36,8 +36,9 @@ def cloud(seed: int, batch: int = 2, points: int = 300) -> tuple[torch.Tensor, t
 
 @pytest.mark.parametrize("part_mask_input", [True, False])
 @pytest.mark.parametrize("backbone", BACKBONES)
-def test_fast_and_dense_network_are_equal(part_mask_input: bool, backbone: str) -> None:
-    net = trained(part_mask_input, backbone)
+@pytest.mark.parametrize("hypotheses", [1, 3])
+def test_fast_and_dense_network_are_equal(part_mask_input: bool, backbone: str, hypotheses: int) -> None:
+    net = trained(part_mask_input, backbone, hypotheses)
     points, valid, mask = cloud(1)
     torch.testing.assert_close(DenseArtFlowNet(net)(points, mask), net(points, valid, mask), atol=1e-4, rtol=1e-4)
     net, points = net.double(), points.double()  # where no rounding hides a difference
@@ -47,9 +48,9 @@ def test_fast_and_dense_network_are_equal(part_mask_input: bool, backbone: str) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("backbone", BACKBONES)
-def test_the_exported_program_equals_the_network(tmp_path: Path, backbone: str) -> None:
-    net, path = trained(backbone=backbone), tmp_path / "net.pt2"
+@pytest.mark.parametrize(("backbone", "hypotheses"), [("pointnet2", 1), ("delayed", 1), ("delayed", 3)])
+def test_the_exported_program_equals_the_network(tmp_path: Path, backbone: str, hypotheses: int) -> None:
+    net, path = trained(backbone=backbone, hypotheses=hypotheses), tmp_path / "net.pt2"
     export(net, path, 300)
     program = torch.export.load(path).module()
     for seed, batch in ((1, 1), (2, 5)):
