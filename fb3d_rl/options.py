@@ -2,14 +2,14 @@
 
 A field that :func:`option` makes is a key of the configuration, one that :func:`group` makes a group of keys; other
 fields are set by code. Checks, the typed schema that Hydra reads, ``--help`` and docs/configuration.md follow from the
-fields. A field of type ``Literal`` has its choices from there.
+fields. A field of type ``Literal`` has its choices from there, one whose choices can grow from a registry.
 """
 
 from __future__ import annotations
 
 import math
 import types
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass, make_dataclass
 from functools import lru_cache, partial
 from typing import Any, Literal, Optional, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -29,17 +29,21 @@ class About:
         unit: of the number.
         within: its range as an interval, such as "[0, 1)" or "(0, inf)"; "" for any.
         null: what null stands for in a configuration until it is decided; "" if there is no null before that.
+        among: the registry that holds its choices, where it has one; what is entered later counts, too.
     """
 
     help: str
     unit: str = ""
     within: str = ""
     null: str = ""
+    among: Collection[str] = ()
 
 
-def option(default: Any, help: str, unit: str = "", within: str = "", null: str = "") -> Any:
+def option(
+    default: Any, help: str, unit: str = "", within: str = "", null: str = "", among: Collection[str] = ()
+) -> Any:
     """A field that is a key of the configuration; see :class:`About`."""
-    about = {_KEY: About(help, unit, within, null)}
+    about = {_KEY: About(help, unit, within, null, among)}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=about)
     return field(default=default, metadata=about)
@@ -83,7 +87,7 @@ def check(options: Any, where: str = "") -> None:
         if is_dataclass(value):
             check(value, f"{key}.")
         elif value is not None:
-            _check_value(key, value, choices(kind), about.within)
+            _check_value(key, value, choices(kind, about), about.within)
 
 
 def _check_value(key: str, value: Any, allowed: tuple[str, ...], within: str) -> None:
@@ -113,8 +117,10 @@ def in_words(within: str) -> str:
     return f"a number {start} " + (f"to {high}" if within[-1] == "]" else f"to below {high}")
 
 
-def choices(kind: Any) -> tuple[str, ...]:
-    """What a key of this type may be, if its type lists that."""
+def choices(kind: Any, about: About) -> tuple[str, ...]:
+    """What a key of this type may be, if its registry or its type lists that."""
+    if about.among:
+        return tuple(about.among)
     listed = [part for part in (kind, *get_args(kind)) if get_origin(part) is Literal]
     return get_args(listed[0]) if listed else ()
 
@@ -166,7 +172,7 @@ def built(values: Any, where: str = "") -> Any:
         if is_dataclass(value):
             value = built(value, f"{key}.")
         elif value is not None:
-            _check_value(key, value, choices(hint), about.within)
+            _check_value(key, value, choices(hint, about), about.within)
         given[item.name] = tuple(value) if get_origin(hint) is tuple else value
     return kind(**given)
 
@@ -178,7 +184,7 @@ def listing(kind: type, where: str = "") -> Iterator[tuple[str, str, str, str]]:
             yield from listing(hint, f"{where}{item.name}.")  # type: ignore[arg-type]
             continue
         default = item.default_factory() if item.default_factory is not MISSING else item.default
-        allowed = ", ".join(choices(hint)) or (in_words(about.within) if about.within else "")
+        allowed = ", ".join(choices(hint, about)) or (in_words(about.within) if about.within else "")
         parts = [allowed, "null" if about.null or type(None) in get_args(hint) else "", about.unit]
         help = about.help + (f"; null: {about.null}" if about.null else "")
         yield where + item.name, _yaml(default), "; ".join(part for part in parts if part), help

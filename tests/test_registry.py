@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.policies.flow_policy import MASK, FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import Learner, LearnerOptions
-from fb3d_rl.registry import REGISTRY, behind, truths, truths_table
+from fb3d_rl.registry import REGISTRY, WITHOUT_MASK, behind, truths, truths_table
 from fb3d_rl.rollout.run import mask_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,14 +46,16 @@ def learned(flow: str, oracle: bool) -> TensorDictModuleBase:
 
 
 POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
-    "expert": lambda: untrained("expert", MASKED),
-    "expert, policy.mask=none": lambda: untrained("expert", MASKLESS),
+    **{
+        name + ending: partial(untrained, name, MASKLESS if ending == WITHOUT_MASK else MASKED)
+        for name, entry in REGISTRY.items()
+        if not entry.trained
+        for ending in entry.told
+    },
     "artflownet": lambda: trained("artflownet", MASKED),
     "artflownet, policy.mask=none": lambda: trained("artflownet", MASKLESS, part_mask_input=False),
     "screwnet": lambda: trained("screwnet", MASKED),
     "ump_di": lambda: trained("ump_di", MASKED),
-    "normal": lambda: untrained("normal", MASKED),
-    "random": lambda: untrained("random", MASKED),
     "bc, dagger": lambda: learned("none", False),
     "bc_flow, dagger_flow": lambda: learned("ground_truth", False),
     "bc_oracle, dagger_oracle": lambda: learned("none", True),

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.options import option
 
-Kind = Literal["raycast", "sapien"]
-
 SENSORS: dict[str, str] = {
     "raycast": "fb3d_rl.camera.raycast:RaycastCamera",
     "sapien": "fb3d_rl.camera.raycast:RaycastCamera",  # where no simulator runs; in the task its renderer draws
@@ -28,10 +26,11 @@ class CameraOptions:
     resolution: int = option(96, "pixels along each side of the square image", within="[8, inf)")
     fov: float = option(40.0, "full field of view", "degrees", "(0, 180)")
     margin: float = option(1.15, "the closed object's bounding sphere fills 1 / margin of the field of view")
-    kind: Kind = option(
+    kind: str = option(
         "raycast",
         "what the simulated task sees with: ray casting on the CPU, or SAPIEN's renderer, which needs Vulkan. They see "
         "the same; flow samples for training always are ray-cast",
+        among=SENSORS,
     )
     shader: Literal["minimal", "default"] = option(
         "minimal",

@@ -29,7 +29,7 @@ def choose_renderer(word: str | None, obs_mode: str | None, render_mode: str | N
         word: the backend that is asked for.
         obs_mode: the task's.
         render_mode: the task's.
-        camera: kind of the depth camera, "raycast" or "sapien".
+        camera: kind of the depth camera; "sapien" alone renders.
 
     Raises:
         UserError: there is no such backend, or it does not render here.
