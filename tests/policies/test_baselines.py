@@ -81,6 +81,6 @@ def test_baselines_are_evaluated_and_random_ones_repeat_in_workers(tmp_path: Pat
         run_evaluation(config("evaluate", [*SMALL, f"policy={policy}", *words]), tmp_path / name)
         rows[name] = [row for row in read_trials(tmp_path / name / "rows.csv") if row.policy != "expert"]
         assert [row.policy for row in rows[name]] == [policy] * 2
-        assert all(row.status == "ok" for row in rows[name]) and (tmp_path / name / "report.html").is_file()
+        assert all(row.status == "ok" for row in rows[name])
     assert rows["again"] == rows["random"]
     assert any(row.contact for row in rows["normal"])
