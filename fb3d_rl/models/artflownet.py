@@ -51,7 +51,10 @@ class ArtFlowNet(CloudNetwork):
     """Predict 3D articulation flow with a PointNet++.
 
     Args:
-        part_mask_input, neighbors, backbone, generator: as of :class:`CloudNetwork`.
+        part_mask_input: as of :class:`CloudNetwork`, and so the next three.
+        neighbors: points kept in a ball.
+        backbone: "pointnet2" or "delayed".
+        generator: draws the first weights.
         hypotheses: K, how many flows it proposes for each cloud, each with a probability; with 1 it is the paper's.
 
     Shapes:
