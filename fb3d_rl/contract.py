@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 
+from fb3d_rl.errors import UserError as UserError  # its earlier place, which scripts of others import it from
+
 ACTION_DIM = 8
 """x y z, roll pitch yaw, two fingers (supplement, II.C)."""
 
