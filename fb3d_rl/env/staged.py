@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -131,15 +133,27 @@ class StagedEnv(BaseEnv):
             return pictures
         return torch.from_numpy(np.stack([stage.picture(PICTURE) for stage in self.stages]))
 
+    def _reconfigure(self, options: Any = None) -> None:
+        with self._window():
+            super()._reconfigure(options)
+
     def render_human(self) -> Any:
         """SAPIEN's viewer.
 
         Raises:
             UserError: there is no screen to open its window on.
         """
-        try:
+        with self._window():
             return super().render_human()
+
+    @contextmanager
+    def _window(self) -> Iterator[None]:
+        """Where SAPIEN's viewer may open its window."""
+        try:
+            yield
         except RuntimeError as error:
+            if self.render_mode != "human":
+                raise
             raise UserError(
                 f"render_mode=human: no window can be opened ({error}); run it where there is a screen, or take "
                 "render_mode=rgb_array"
