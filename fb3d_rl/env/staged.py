@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -134,7 +134,7 @@ class StagedEnv(BaseEnv):
         return torch.from_numpy(np.stack([stage.picture(PICTURE) for stage in self.stages]))
 
     def _reconfigure(self, options: Any = None) -> None:
-        with self._window():
+        with self._window() if self.render_mode == "human" else nullcontext():
             super()._reconfigure(options)
 
     def render_human(self) -> Any:
@@ -152,8 +152,6 @@ class StagedEnv(BaseEnv):
         try:
             yield
         except RuntimeError as error:
-            if self.render_mode != "human":
-                raise
             raise UserError(
                 f"render_mode=human: no window can be opened ({error}); run it where there is a screen, or take "
                 "render_mode=rgb_array"
