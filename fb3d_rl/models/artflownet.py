@@ -87,12 +87,8 @@ class ArtFlowNet(CloudNetwork):
         self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None, propose: bool = False
     ) -> Tensor | Hypotheses:
         """See the class; with ``propose`` all hypotheses."""
-        output = self.per_point(points, valid, part_mask)
-        if propose:
-            return self.hypotheses_of(output)
-        if self.hypotheses == 1:
-            return output
-        return self.most_probable(self.hypotheses_of(output), valid, part_mask)
+        found = self.propose(points, valid, part_mask)
+        return found if propose else self.most_probable(found, valid, part_mask)
 
     def propose(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> Hypotheses:
         """All hypotheses for clouds as of the class."""
@@ -101,13 +97,15 @@ class ArtFlowNet(CloudNetwork):
     def hypotheses_of(self, output: Tensor) -> Hypotheses:
         """What :meth:`per_point` yields [B, N, outputs], read as hypotheses."""
         if self.hypotheses == 1:
-            return Hypotheses(output[:, None], output.new_zeros(len(output), 1, output.shape[1]))
+            return Hypotheses(output[:, None], torch.zeros_like(output[:, None, :, 0]))
         flows, scores = output.split([self.OUTPUTS * self.hypotheses, self.hypotheses], 2)
         flows = flows.unflatten(2, (self.hypotheses, self.OUTPUTS)).transpose(1, 2)
         return Hypotheses(flows, scores.float().log_softmax(2).transpose(1, 2))
 
     def most_probable(self, found: Hypotheses, valid: Tensor, part_mask: Tensor | None) -> Tensor:
         """The flow [B, N, 3] of the most probable hypothesis, see the class."""
+        if self.hypotheses == 1:
+            return found.flows[:, 0]
         if self.part_mask_input:
             assert part_mask is not None
             best = found.of_clouds(part_mask & valid).argmax(1)[:, None].expand_as(valid)
@@ -134,13 +132,10 @@ class ArtFlowNet(CloudNetwork):
             UserError: a shape is another, or the mask is missing.
         """
         cloud, mask = self._checked(points, part_mask)
-        flows, probabilities = self._dealt(cloud, mask)
-        if self.hypotheses == 1:
-            flow = flows[0]
-        else:
-            valid = cloud.isfinite().all(1)
-            flow = self.most_probable(Hypotheses(flows[None], probabilities[None]), valid[None], mask[None])[0]
-        return _as_given(flow, points)
+        flows, log_probabilities = self._dealt(cloud, mask)
+        valid = cloud.isfinite().all(1)
+        flow = self.most_probable(Hypotheses(flows[None], log_probabilities[None]), valid[None], mask[None])
+        return _as_given(flow[0], points)
 
     @torch.no_grad()
     def predict_all(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None = None) -> tuple[Cloud, Cloud]:

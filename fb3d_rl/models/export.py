@@ -45,11 +45,8 @@ class DenseArtFlowNet(nn.Module):
         rows = _propagate(network.fp1, fine, points1, own, points)
         dense, last = network.head
         assert isinstance(dense, DenseMLP)
-        output: Tensor = last(_layers(dense, rows))
-        if self.net.hypotheses == 1:
-            return output
-        every = torch.ones_like(part_mask)
-        return self.net.most_probable(self.net.hypotheses_of(output), every, part_mask)
+        found = self.net.hypotheses_of(last(_layers(dense, rows)))
+        return self.net.most_probable(found, torch.ones_like(part_mask), part_mask)
 
 
 def export(net: ArtFlowNet, path: Path, points: int) -> None:
