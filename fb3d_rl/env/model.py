@@ -70,10 +70,9 @@ class Model(Posed):
         What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
         move as both sides of their surface, placed in the world: a hull would close hollow bodies.
         """
-        moves = self.tree.descendants.any(0).tolist()
         poses = self.poses(np.zeros(len(self.obj.movable)))
         shapes: list[list[Any]] = []
-        for link, pose, moving in zip(self.obj.links, poses, moves, strict=True):
+        for link, pose, moving in zip(self.obj.links, poses, self.tree.moves.tolist(), strict=True):
             shapes.append([])
             for mesh in link.collisions:
                 if moving:
@@ -124,8 +123,7 @@ class Model(Posed):
         Only a static body can have a surface as its shape.
         """
         static = PhysxRigidStaticComponent()
-        moves = self.tree.descendants.any(0).tolist()
-        for component, shapes, moving in zip(links, self.shapes, moves, strict=True):
+        for component, shapes, moving in zip(links, self.shapes, self.tree.moves.tolist(), strict=True):
             for shape in shapes:
                 (component if moving else static).attach(shape)
         return static

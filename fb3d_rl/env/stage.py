@@ -140,7 +140,7 @@ class Stage:
 
     def holdable(self, hold: str) -> list[int]:
         """The links that suction may hold, by :attr:`fb3d_rl.env.options.SuctionOptions.hold`."""
-        parts = self.tree.descendants.any(0) if hold == "any" else self.moved
+        parts = self.tree.moves if hold == "any" else self.moved
         return [int(i) for i in parts.nonzero().flatten()]
 
     def begin(self, options: SuctionOptions) -> None:

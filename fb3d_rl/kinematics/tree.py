@@ -59,6 +59,11 @@ class KinematicTree:
         )
 
     @cached_property
+    def moves(self) -> Tensor:
+        """Whether any joint moves each link [L] bool."""
+        return self.descendants.any(0)
+
+    @cached_property
     def screws(self) -> Tensor:
         """Axes [J, 3, 2] of joints that turn (first column) and that slide (second column) in their links' frames."""
         slides = torch.tensor(self.prismatic, device=self.axes.device)[self.movable, None]
