@@ -413,6 +413,18 @@ def test_a_window_that_cannot_be_opened_is_named(env: OpenArticulatedEnv, monkey
         env.render_human()
 
 
+def test_nor_the_window_that_the_first_reset_opens(env: OpenArticulatedEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    def no_screen(self: object, options: object) -> None:
+        raise RuntimeError("Create window failed")
+
+    monkeypatch.setattr(BaseEnv, "_reconfigure", no_screen)
+    with pytest.raises(RuntimeError, match="Create window failed"):  # without a window it is another fault
+        env._reconfigure({})
+    monkeypatch.setattr(env, "render_mode", "human")
+    with pytest.raises(UserError, match="screen"):
+        env._reconfigure({})
+
+
 def test_an_environment_without_objects_is_refused() -> None:
     with pytest.raises(UserError, match="object"):
         OpenArticulatedEnv([])

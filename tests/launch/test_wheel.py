@@ -29,7 +29,8 @@ def fb3d(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
     tracked = run("git", "ls-files", "-co", "--exclude-standard", cwd=ROOT).stdout.split("\n")
     for name in filter(None, tracked):
-        if (ROOT / name).is_file() and not name.startswith("results/") or name.startswith("results/pretrained"):
+        kept = not name.startswith("results/") or name.startswith("results/pretrained")
+        if kept and (ROOT / name).is_file():
             (folder / "source" / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(ROOT / name, folder / "source" / name)
     pip = (sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check")
