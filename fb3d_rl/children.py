@@ -1,4 +1,4 @@
-"""Processes that a command starts: Ctrl-C reaches them through their parent alone."""
+"""Processes that a command starts: Ctrl-C reaches only their parent, which ends them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def withheld() -> Iterator[None]:
 
 @contextmanager
 def worker_pool(workers: int, initializer: Callable[[], None] | None = None) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes, which an error or Ctrl-C ends in the middle of their work. Submit in :func:`withheld`."""
+    """A pool of processes, which an error or Ctrl-C ends at once. Submit in :func:`withheld`."""
     others = set(active_children())
     # Spawned: a forked process would inherit torch's threads in the middle of what they do.
     with ProcessPoolExecutor(workers, get_context("spawn"), initializer) as pool:

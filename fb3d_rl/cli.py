@@ -30,7 +30,7 @@ def main() -> NoReturn:
         print("usage: fb3d COMMAND ...\n")
         for name, help_ in COMMANDS.items():
             print(f"  {name:10}{help_}")
-        print("\nfb3d COMMAND --help tells more.")
+        print("\nfb3d COMMAND --help shows a command's options.")
         sys.exit(0)
     if words[0] == "--version":
         from importlib.metadata import version

@@ -1,6 +1,6 @@
-"""The configuration of each command, and the checks that come before any work. Only launch/ imports this.
+"""The configuration of each command, and its checks before any work. Only launch/ imports this.
 
-What each key means stands in the options classes that the groups are of; conf/*.yaml holds what differs from their
+The keys are described in the options classes of the groups; conf/*.yaml holds the values that differ from their
 defaults. ``python -m fb3d_rl.config`` prints docs/configuration.md.
 """
 
@@ -35,9 +35,9 @@ class CommandConfig:
     policy: PolicyOptions = group(PolicyOptions)
     collector: CollectorOptions = group(CollectorOptions)
     evaluation: EvaluationOptions = group(EvaluationOptions)
-    seed: int = option(0, "of all random draws", within="[0, inf)")
+    seed: int = option(0, "seed of all random draws", within="[0, inf)")
     device: Literal["auto", "cpu", "cuda"] = option(
-        "auto", "where networks are trained and measured; policies decide on the CPU, in the workers"
+        "auto", "device on which networks are trained and measured; policies run on the CPU, in the workers"
     )
 
 
@@ -63,13 +63,13 @@ class ViewConfig(CommandConfig):
     """Everything that launch/view.py needs."""
 
     checkpoint: str | None = option(
-        None, "an ArtFlowNet: checkpoint.pt, .safetensors or pretrained; null shows the true flow alone"
+        None, "an ArtFlowNet: checkpoint.pt, .safetensors or pretrained; null shows only the true flow"
     )
     object: Any = option(
-        None, "the folder of an object, an id, or a category, of which it is the first; null: the first of all"
+        None, "the folder of an object, an id, or a category, whose first object is shown; null: the first object"
     )
     port: int = option(
-        8080, "where the page is served, on this machine alone; the next free one if it is taken", within="[1, 65535]"
+        8080, "port of the page, which only this machine reaches; the next free one if it is taken", within="[1, 65535]"
     )
 
 
@@ -90,10 +90,10 @@ def schemas(command: str) -> dict[tuple[str | None, str], type]:
 
 
 def configured(values: Any) -> Any:
-    """The checked configuration for which an instance of a command's schema stands.
+    """The checked configuration with the values of an instance of a command's schema.
 
     Raises:
-        UserError: names the first key that is wrong and what it may be.
+        UserError: names the first wrong key and its allowed values.
     """
     cfg = built(values)
     validate(cfg)
@@ -101,10 +101,10 @@ def configured(values: Any) -> Any:
 
 
 def validate(cfg: CommandConfig) -> None:
-    """Check what no single key shows; ranges are checked when a configuration is built (:func:`configured`).
+    """Check combinations of keys; ranges are checked when a configuration is built (:func:`configured`).
 
     Raises:
-        UserError: names the first key that is wrong and what it may be.
+        UserError: names the first wrong key and its allowed values.
     """
     one_of("policy.name", cfg.policy.name, tuple(REGISTRY))
     if cfg.policy.contact.reach <= cfg.policy.contact.clearance:
@@ -184,7 +184,7 @@ def one_of(key: str, value: str, choices: tuple[str, ...]) -> None:
     """Check that a key has one of its values.
 
     Raises:
-        UserError: it has not; says which there are.
+        UserError: it has not; names the values.
     """
     if value not in choices:
         raise UserError(f"{key}={value} is unknown; choose from {', '.join(choices)}")
@@ -211,7 +211,7 @@ def sections(command: str) -> dict[str, list[tuple[str, str, str, str]]]:
 
 
 def help_of(command: str) -> str:
-    """What ``--help`` says of each key."""
+    """The text of ``--help`` on each key."""
     lines = []
     for title, rows in sections(command).items():
         lines.append(f"\n== {title} ==")

@@ -1,4 +1,4 @@
-"""Errors that a user can mend, and the one sentence and exit code in which they end a command."""
+"""Errors that a user can fix; each ends a command with one sentence and an exit code."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from fb3d_rl.interrupt import caused
 
 
 class UserError(Exception):
-    """An error that the user caused and can mend; its message is one clear sentence.
+    """An error that the user caused and can fix; its message is one clear sentence.
 
-    Commands print the message alone and end with exit code 2.
+    Commands print only the message and end with exit code 2.
     """
 
 
@@ -21,7 +21,7 @@ class Interrupted(UserError):
 
 
 def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
-    """Run a command and turn what the user can mend into one sentence on stderr.
+    """Run a command and turn an error that the user can fix into one sentence on stderr.
 
     Args:
         work: the command; returns its exit code, or None for 0.
@@ -37,8 +37,8 @@ def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
     except (Exception, KeyboardInterrupt) as error:
         if caused(error):
             sentence = f"interrupted; {interrupted}"
-        elif isinstance(error, OSError) and (found := of_disk(error)) is not None:
-            sentence = found
+        elif isinstance(error, OSError) and (disk_error := of_disk(error)) is not None:
+            sentence = disk_error
         else:
             raise
     print(f"error: {sentence}", file=sys.stderr)
@@ -46,7 +46,7 @@ def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
 
 
 def of_disk(error: OSError) -> str | None:
-    """What the disk or a file is at fault of; None if it is not."""
+    """The sentence for an error of the disk or a file; None for other errors."""
     if error.filename is not None:
         return f"{error.filename} cannot be written or read ({error.strerror})"
     full = (errno.ENOSPC, getattr(errno, "EDQUOT", None))

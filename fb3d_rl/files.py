@@ -36,6 +36,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, *contents: bytes | memoryview) -> None:
-    """The same for ``contents``, one after the other, as they are."""
+    """Replace ``path`` by ``contents``, one after the other, in one step."""
     with replacing(path) as beside, beside.open("wb") as file:
         file.writelines(contents)

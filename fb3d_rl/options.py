@@ -1,4 +1,4 @@
-"""Options that say themselves: frozen dataclasses whose fields carry a help text, a unit and a range.
+"""Options that describe themselves: frozen dataclasses whose fields carry a help text, a unit and a range.
 
 A field that :func:`option` makes is a key of the configuration, one that :func:`group` makes a group of keys; other
 fields are set by code. Checks, the typed schema that Hydra reads, ``--help`` and docs/configuration.md follow from the
@@ -22,14 +22,14 @@ _KEY = "option"
 
 @dataclass(frozen=True)
 class About:
-    """What a field says of itself.
+    """Description of a field.
 
     Attributes:
         help: one sentence.
-        unit: of the number.
-        within: its range as an interval, such as "[0, 1)" or "(0, inf)"; "" for any.
-        null: what null stands for in a configuration until it is decided; "" if there is no null before that.
-        among: the registry that holds its choices, where it has one; what is entered later counts, too.
+        unit: unit of the number.
+        within: range of the number as an interval, such as "[0, 1)" or "(0, inf)"; "" for any.
+        null: the meaning of null in a configuration; "" if null is not allowed.
+        among: the registry that holds the allowed values, if there is one; entries that are added later count too.
     """
 
     help: str
@@ -55,7 +55,7 @@ def group(kind: type) -> Any:
 
 
 def keys(kind: type) -> tuple[tuple[Field[Any], Any, About], ...]:
-    """The fields of ``kind`` that are keys or groups of keys, each with its type and what it says of itself."""
+    """The fields of ``kind`` that are keys or groups of keys, each with its type and its description."""
     hints = get_type_hints(kind)
     return tuple((item, hints[item.name], item.metadata[_KEY]) for item in fields(kind) if _KEY in item.metadata)
 
@@ -77,10 +77,10 @@ def check(options: Any, where: str = "") -> None:
 
     Args:
         options: the options.
-        where: what stands before the names of their keys, such as "env.".
+        where: prefix of their keys, such as "env.".
 
     Raises:
-        UserError: names the first key that is wrong and what it may be.
+        UserError: names the first wrong key and its allowed values.
     """
     for item, kind, about in keys(type(options)):
         value, key = getattr(options, item.name), where + item.name
@@ -118,7 +118,7 @@ def in_words(within: str) -> str:
 
 
 def choices(kind: Any, about: About) -> tuple[str, ...]:
-    """What a key of this type may be, if its registry or its type lists that."""
+    """The allowed values of a key, if its registry or its type lists them."""
     if about.among:
         return tuple(about.among)
     listed = [part for part in (kind, *get_args(kind)) if get_origin(part) is Literal]
@@ -126,8 +126,8 @@ def choices(kind: Any, about: About) -> tuple[str, ...]:
 
 
 def schema(kind: type) -> type:
-    """The dataclass that stands for ``kind`` in Hydra, which knows no Literal, no tuples and nothing that is frozen."""
-    return _schema(kind)
+    """The dataclass for Hydra in place of ``kind``: Hydra supports neither Literal nor tuples nor frozen classes."""
+    return _schema(kind)  # a cached function has no type of its own
 
 
 @lru_cache
@@ -136,7 +136,7 @@ def _schema(kind: type) -> type:
     for item, hint, about in keys(kind):
         typed: Any = _typed(hint)
         if about.null:
-            typed = Optional[typed]  # noqa: UP045, of a class that is known at run time alone
+            typed = Optional[typed]  # noqa: UP045, of a class that is known only at run time
         factory: Any = item.default_factory
         if is_dataclass(typed):
             factory = typed
@@ -161,10 +161,10 @@ def _typed(hint: Any) -> Any:
 
 
 def built(values: Any, where: str = "") -> Any:
-    """The options for which an instance of a :func:`schema` stands, checked; ``where`` as in :func:`check`.
+    """The checked options with the values of an instance of a :func:`schema`; ``where`` as in :func:`check`.
 
     Raises:
-        UserError: names the first key that is wrong and what it may be.
+        UserError: names the first wrong key and its allowed values.
     """
     kind, given = values.__options__, {}
     for item, hint, about in keys(kind):
@@ -178,7 +178,7 @@ def built(values: Any, where: str = "") -> Any:
 
 
 def listing(kind: type, where: str = "") -> Iterator[tuple[str, str, str, str]]:
-    """Of each key: its dotted name, its default as in YAML, what it may be, and its help."""
+    """Each key's dotted name, default as in YAML, allowed values and help."""
     for item, hint, about in keys(kind):
         if is_dataclass(hint):
             yield from listing(hint, f"{where}{item.name}.")  # type: ignore[arg-type]

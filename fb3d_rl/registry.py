@@ -1,7 +1,7 @@
-"""Every algorithm and policy, entered once: what makes it act, what trains it, its options, and what it is told.
+"""The table of algorithms and policies: how each acts and is trained, its options, and its privileged inputs.
 
-A new one is a file, an entry here, and a yaml in conf/policy/ and, if it is trained, in conf/algo/. What stands behind
-a name is imported when it is asked for, so that commands refuse a wrong configuration at once.
+A new one is a file, an entry here, and a yaml in conf/policy/ and, if it is trained, in conf/algo/. The code
+of an entry is imported when it is used, so that commands refuse a wrong configuration at once.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ FLOW = ("privileged", "flow")
 
 @dataclass(frozen=True)
 class Told:
-    """What a policy is told that a camera and the hand's own joints do not show.
+    """Inputs of a policy beyond points and proprioception.
 
     Attributes:
-        words: what that means.
-        mask: which of the points it sees are those of the part to open.
+        words: description of its privileged inputs.
+        mask: whether it gets the mask of the part to open.
         truth: the privileged keys that it reads.
     """
 
@@ -31,15 +31,15 @@ class Told:
 
 @dataclass(frozen=True)
 class Entry:
-    """A policy, and how it is trained if it is; code is named as "module:object".
+    """A policy, and its training if it has one; code is named as "module:object".
 
     Attributes:
-        told: what the policy is told, by what its name in tables ends with.
-        act: of a policy that is not trained, ``act(limits, flow policy's options)`` makes it.
-        algorithm: a :class:`fb3d_rl.algos.algorithm.Algorithm`, which trains it and loads what was trained.
+        told: the policy's inputs, by the ending of its name in tables.
+        act: ``act(limits, flow policy's options)`` makes a policy that is not trained.
+        algorithm: a :class:`fb3d_rl.algos.algorithm.Algorithm`, which trains it and loads its checkpoints.
         options: the dataclass of the keys of ``algo`` (:class:`fb3d_rl.algos.options.AlgoOptions`).
-        opens_only: whether it learns to open and nothing else, so that it cannot reach other goals.
-        joint_fit: whether several processes may fit together.
+        opens_only: whether it can only open parts fully, so that it has no other goals.
+        joint_fit: whether several processes can fit it together.
     """
 
     told: Mapping[str, Told]
@@ -56,7 +56,7 @@ class Entry:
 
     @property
     def maskless(self) -> bool:
-        """Whether it can do without the mask of the part to open."""
+        """Whether it can act without the mask of the part to open."""
         return not all(told.mask for told in self.told.values())
 
 
@@ -104,11 +104,11 @@ REGISTRY = {
     "bc": IMITATION,
     "dagger": IMITATION,
 }
-"""The entries by the name of algorithm, checkpoints and policy."""
+"""The entries by name."""
 
 
 def behind(name: str) -> Any:
-    """What "module:object" names."""
+    """The object of the name "module:object"."""
     return resolve_name(name)
 
 
@@ -123,9 +123,9 @@ def untrained() -> tuple[str, ...]:
 
 
 def truths() -> dict[str, Told]:
-    """What each policy is told, by the names in tables of those that are told the same.
+    """The inputs of each policy, by the names in tables of the policies that share them.
 
-    Gates, which take part in training only, change nothing of it.
+    Gates act in training only and are not part of it.
     """
     named: dict[tuple[int, str], list[str]] = {}
     for name, entry in REGISTRY.items():

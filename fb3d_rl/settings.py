@@ -1,12 +1,9 @@
-"""Settings as YAML has them (nested mappings, told apart by dotted keys), and the names that they know."""
+"""Settings as YAML has them: nested mappings, whose values have dotted keys."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from typing import Any
-
-UNTRAINED = ("expert", "random", "normal")
-"""Policies that need no checkpoint."""
 
 
 def leaves(tree: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

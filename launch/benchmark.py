@@ -25,7 +25,7 @@ BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak", "ne
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code (2: an error that the user can mend)."""
+    """Run the command; returns the exit code (2: an error that the user can fix)."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("names", metavar="NAME", nargs="*", help=f"{', '.join(BENCHMARKS)}; all of them unless given")
     parser.add_argument("--root", help="folder of PartNet-Mobility objects; procedural ones unless given")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors come here as exceptions, in place of Hydra's own printout
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells about every memory map
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs every memory map
 
 import hydra
 import run_folder
@@ -33,10 +33,10 @@ CONF = str(folder("conf"))
 def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> None:
     """Run ``task(config, run folder)`` with conf/<name>.yaml and the overrides of the command line.
 
-    With ``keeps=False`` nothing is kept of a run: hydra.run.dir is no folder of its own, and nothing is written there.
+    With ``keeps=False`` a run has no folder of its own, and nothing is written to hydra.run.dir.
 
-    Exit codes: 0, or 2 with one sentence on stderr for whatever the user can mend. A job of a sweep (-m) that fails
-    leaves the others alone: it is named when it does and in the end, and the exit code is 2.
+    Exit codes: 0, or 2 with one sentence on stderr for an error that the user can fix. A job of a sweep (-m) that fails
+    does not stop the others: it is named when it fails and at the end, and the exit code is 2.
     """
     process = os.getpid()
     failed: dict[str, str] = {}  # what is wrong with jobs of a sweep
@@ -55,11 +55,11 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
         jobs.append(f"job {hydra_config.job.num} ({' '.join(swept)})")
         try:
             _run(raw, name, task, keeps, f"{jobs[-1]}: ")
-        except _Failed as failure:
-            if os.getpid() != process:  # a launcher of other processes hands on what is raised
-                raise UserError(failure.sentence) from None
-            failed[jobs[-1]] = failure.sentence
-        except Exception as error:  # noqa: BLE001, a fault of the program, which is not one of the other jobs'
+        except _Failed as end:
+            if os.getpid() != process:  # a launcher of processes passes exceptions on
+                raise UserError(end.sentence) from None
+            failed[jobs[-1]] = end.sentence
+        except Exception as error:  # noqa: BLE001, a fault of the program must not stop the other jobs
             if os.getpid() != process:
                 raise
             traceback.print_exc()
@@ -79,7 +79,7 @@ def main(name: str, task: Callable[[Any, Path], Any], keeps: bool = True) -> Non
 
 
 def _run(raw: DictConfig, name: str, task: Callable[[Any, Path], Any], keeps: bool, where: str = "") -> None:
-    """Run the task with what Hydra composed, as :func:`main` says; ``where`` stands before what is wrong."""
+    """Run the task with what Hydra composed, as :func:`main` says; ``where`` is put before an error's sentence."""
     out = Path(HydraConfig.get().runtime.output_dir)
     with _one_sentence(where):
         if not keeps:
@@ -91,7 +91,7 @@ def _run(raw: DictConfig, name: str, task: Callable[[Any, Path], Any], keeps: bo
                 composed = OmegaConf.to_object(run_folder.configuration(raw, name, out))
                 task(config.configured(composed), out)
             except UserError:
-                # A run that never began leaves no folder; only who holds it may take it away.
+                # A run that never began leaves no folder; only the process with the lock may remove it.
                 if fresh and out.is_dir() and run_folder.is_new(out, run_folder.CONFIG):
                     shutil.rmtree(out)
                 raise
@@ -108,7 +108,7 @@ def report(out: Path) -> None:
 
 
 class _Failed(SystemExit):
-    """Ends the process, or this job of a sweep, once it has been said what is wrong."""
+    """Ends the process, or this job of a sweep, after its error was printed."""
 
     def __init__(self, sentence: str) -> None:
         super().__init__(2)
@@ -117,9 +117,9 @@ class _Failed(SystemExit):
 
 @contextmanager
 def _one_sentence(where: str = "") -> Iterator[None]:
-    """Turn an error that the user can mend into one sentence; inside the job, before Hydra adds words of its own."""
+    """Turn an error that the user can fix into one sentence; inside the job, before Hydra adds its own message."""
 
-    def say(sentence: str) -> _Failed:
+    def failure(sentence: str) -> _Failed:
         sentence = " ".join(sentence.split())
         print(f"error: {where}{sentence}", file=sys.stderr)
         return _Failed(sentence)
@@ -127,17 +127,17 @@ def _one_sentence(where: str = "") -> Iterator[None]:
     try:
         yield
     except Interrupted as error:
-        sys.exit(say(str(error)).code)  # the whole sweep
+        sys.exit(failure(str(error)).code)  # the whole sweep
     except UserError as error:
-        raise say(str(error)) from error
+        raise failure(str(error)) from error
     except (Exception, KeyboardInterrupt) as error:
         if interrupt.caused(error):
             hint = "a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER"
-            sys.exit(say(f"interrupted; {hint}").code)
+            sys.exit(failure(f"interrupted; {hint}").code)
         if isinstance(error, HydraException | OmegaConfBaseException):
-            raise say(_sentence(error)) from error
+            raise failure(_sentence(error)) from error
         if isinstance(error, OSError) and (sentence := of_disk(error)) is not None:
-            raise say(f"{sentence}; choose another folder: hydra.run.dir=DIR") from error
+            raise failure(f"{sentence}; choose another folder: hydra.run.dir=DIR") from error
         raise
 
 

@@ -1,4 +1,4 @@
-"""Record the expert's demonstrations, look at them, choose among them, and take them elsewhere.
+"""Record, show, filter, export and import the expert's demonstrations.
 
 python launch/demos.py record DEMOS [--successful] [--root DIR --split SPLIT] [--trials N]
 python launch/demos.py list DEMOS [--episode N]
@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL tells about every memory map
+os.environ.setdefault("RL_LOGGING_LEVEL", "WARNING")  # TorchRL logs every memory map
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code (2: an error that the user can mend)."""
+    """Run the command; returns the exit code (2: an error that the user can fix)."""
     options = _parser().parse_args(arguments)
     # Imported late: --help answers at once.
     from fb3d_rl.errors import exit_code
@@ -58,7 +58,7 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--split", default="all", help="which of them: a split, a category, ids (default: all)")
     record.add_argument("--categories", default="StorageFurniture,Microwave,KitchenPot", help="of procedural objects")
     record.add_argument("--objects", type=int, default=10, help="procedural objects of each category (default: 10)")
-    record.add_argument("--trials", type=int, help="how many; one for each part that opens unless given")
+    record.add_argument("--trials", type=int, help="number of trials; one for each part that opens unless given")
     record.add_argument("--successful", action="store_true", help="keep only episodes that end with success")
     record.add_argument("--points", type=int, default=1200, help="points of a cloud (default: 1200)")
     record.add_argument("--horizon", type=int, default=150, help="control steps at most (default: 150)")
@@ -138,7 +138,7 @@ def record(options: argparse.Namespace) -> None:
     if crashed:
         print(f"{len(crashed)} of {len(scheduled)} trials crashed and are left out; the first: {crashed[0]}")
     if not len(buffer):
-        raise UserError(f"none of the {len(scheduled)} trials is worth keeping, so {options.demos} is empty")
+        raise UserError(f"none of the {len(scheduled)} trials was kept, so {options.demos} is empty")
     print(f"wrote {options.demos}")
 
 
@@ -159,7 +159,9 @@ def show(options: argparse.Namespace) -> None:
     from fb3d_rl.errors import UserError
 
     if options.out.suffix not in (".png", ".gif", ".mp4"):
-        raise UserError(f"--out {options.out} is no picture or film; choose a name that ends in .png, .gif or .mp4")
+        raise UserError(
+            f"--out {options.out} is neither a picture nor a film; choose a name that ends in .png, .gif or .mp4"
+        )
     buffer = DemonstrationBuffer.open(options.demos)
     episode = _episode(buffer, options.episode)
     from fb3d_rl.drawing.video import require_encoder
@@ -175,7 +177,7 @@ def show(options: argparse.Namespace) -> None:
     options.out.parent.mkdir(parents=True, exist_ok=True)
     (write_filmstrip if options.out.suffix == ".png" else write_video)(film, options.out)
     if not exact:
-        print("the episode did not repeat exactly: object, program or machine are not those that recorded it")
+        print("the episode did not repeat exactly: object, program or machine differ from the recording's")
     print(f"wrote {options.out}")
 
 
@@ -215,7 +217,7 @@ def export(options: argparse.Namespace) -> None:
     print(f"wrote {options.out}")
 
 
-def take_in(options: argparse.Namespace) -> None:
+def import_file(options: argparse.Namespace) -> None:
     """Read another format."""
     from fb3d_rl.data import lerobot, maniskill
 
@@ -230,7 +232,7 @@ COMMANDS: dict[str, Callable[[argparse.Namespace], None]] = {
     "show": show,
     "filter": choose,
     "export": export,
-    "import": take_in,
+    "import": import_file,
 }
 
 

@@ -1,7 +1,7 @@
 """Write a trained ArtFlowNet for use elsewhere.
 
 python launch/export.py RUN/checkpoint.pt flow.safetensors     weights, for ArtFlowNet.from_pretrained
-python launch/export.py RUN/checkpoint.pt flow.pt2             a program of torch.export, which needs PyTorch alone
+python launch/export.py RUN/checkpoint.pt flow.pt2             a program of torch.export, which needs only PyTorch
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code (2: an error that the user can mend)."""
+    """Run the command; returns the exit code (2: an error that the user can fix)."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

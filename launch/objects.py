@@ -1,4 +1,4 @@
-"""Make procedural objects, unpack and list objects, look at them, and find out what is wrong with them.
+"""Make procedural objects; unpack, list, validate and preview objects.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
 python launch/objects.py unpack ARCHIVE --out DIR

@@ -23,7 +23,7 @@ VARIANTS = ("mask", "no_mask", "no_mask_vpa")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit code (2: an error that the user can mend)."""
+    """Run the command; returns the exit code (2: an error that the user can fix)."""
     parser = argparse.ArgumentParser(description="Write the report of a run, or compare several runs.")
     parser.add_argument(
         "runs", metavar="FOLDER", nargs="+", type=Path, help="a run folder, or a folder with runs below it (a sweep's)"

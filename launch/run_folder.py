@@ -1,4 +1,4 @@
-"""The run folder of a command: a new one, or one that goes on with the configuration that it was begun with."""
+"""The run folder of a command: a new one, or one that is resumed with its own configuration."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RUN_FILES = frozenset(
         "samples", "met", "buffer", "objects",
     }
 )  # fmt: skip
-"""What a run leaves in its folder; a new run wants a folder without any of it."""
+"""The files of a run; a new run needs a folder without any of them."""
 
 
 def changes_no_number(key: str) -> bool:
@@ -69,7 +69,7 @@ def locked(out: Path) -> Iterator[None]:
     try:
         yield
     except UserError:
-        if not left_behind:  # what is refused leaves no trace
+        if not left_behind:  # a refused run leaves no file
             (out / LOCK).unlink(missing_ok=True)
         raise
     finally:
@@ -156,8 +156,8 @@ def _touched(raw: DictConfig, name: str) -> set[str]:
         if isinstance(override.value(), str) and (Path(_conf()) / key).is_dir():
             # What the group sets: whatever differs from a composition that goes without it.
             without = _leaves(compose(name, [f"~{key}"]))
-            alone = _leaves(compose(name, [override.input_line or ""]))
-            below = {leaf for leaf in {*without, *alone} if without.get(leaf, _leaves) != alone.get(leaf, _leaves)}
+            single = _leaves(compose(name, [override.input_line or ""]))
+            below = {leaf for leaf in {*without, *single} if without.get(leaf, _leaves) != single.get(leaf, _leaves)}
             below |= _own_keys(key)  # even where it says what is the default
         keys |= below or {key}
     return keys

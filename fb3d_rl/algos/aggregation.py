@@ -1,7 +1,6 @@
-"""Clouds that a network's own policy meets while it acts, labelled with the true flow: DAgger for the flow network.
+"""Clouds from rollouts of a network's own policy, labelled with the true flow: DAgger for the flow network.
 
-They show what samples of an object alone do not: the hand in front of it, and parts that stand half open where that
-policy left them.
+Unlike samples of an object alone they show the hand in front of it, and parts as far open as the policy left them.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from fb3d_rl.rollout.trials import BARREN, draw_trials
 from fb3d_rl.scene.posed import Posed
 
 EVERY = 0.2
-"""Time (s) from one frame that is kept to the next: sooner they are nearly alike."""
+"""Time (s) between frames that are kept; closer ones are nearly alike."""
 
 KEYS: tuple[Key, ...] = (
     *(("observation", key) for key in ("points", "valid", "part_mask")),
@@ -38,7 +37,7 @@ KEYS: tuple[Key, ...] = (
 )
 
 
-def meet_samples(
+def rollout_samples(
     out: Path,
     objects: Sequence[ArticulatedObject],
     policy: TensorDictModuleBase,
@@ -47,22 +46,22 @@ def meet_samples(
     made_by: dict[str, Any],
     progress: Callable[[int], None] = lambda done: None,
 ) -> TensorDictBase:
-    """Run trials with a policy and keep every few frames in which something visible moves, until there are ``count``.
+    """Run trials with a policy until ``count`` samples are kept: every few frames in which a visible part can move.
 
     Args:
         out: folder of the memory map; a finished one that was made from the same arguments is reused.
         objects: the objects to train on; a trial's category, object and part are drawn with equal odds.
-        policy: acts.
+        policy: the policy that acts.
         count: number of samples S.
         protocol: clouds, task, workers and seed.
-        made_by: what else decides the samples, such as the policy's weights; kept in the folder.
+        made_by: what else the samples depend on, such as the policy's weights; part of the recipe.
         progress: called with the number of samples so far.
 
     Returns:
         TensorDict [S] as :func:`fb3d_rl.data.generate.generate_samples` gives it.
 
     Raises:
-        UserError: many trials in succession crashed or showed nothing that moves.
+        UserError: many trials in succession crashed or showed no part that can move.
     """
     recipe = {"objects": [[obj.id, content_digest(obj)] for obj in objects], "count": count, "seed": protocol.seed,
               "made_by": made_by, "samples": asdict(protocol.samples), "env": asdict(protocol.env)}  # fmt: skip
@@ -81,9 +80,9 @@ def meet_samples(
         while filled < count:
             trials = draw_trials(views, protocol.samples, rng, min(24, 1 + (count - filled) // 10))
             frames = {episode.index: episode.frames for episode in workers.run(trials, KEYS)}
-            for index, trial in enumerate(trials):  # in this order, whichever ended first
+            for index, trial in enumerate(trials):  # in the order of the trials, not in that of their ends
                 episode = frames[index]
-                barren += 1  # until it shows something
+                barren += 1  # set to 0 below if the trial gives samples
                 if episode is None:
                     continue
                 seen = episode[::every]
@@ -101,8 +100,8 @@ def meet_samples(
                 filled = part.stop
             if barren >= BARREN and filled < count:
                 raise UserError(
-                    f"none of the last {barren} trials in which clouds were to be met showed a part that moves; choose "
-                    "other objects, or leave data.met_by=null"
+                    f"none of the last {barren} trials of the policy data.met_by showed a part that can move; choose "
+                    "other objects, or set data.met_by=null"
                 )
             progress(filled)
     finish(out, recipe)

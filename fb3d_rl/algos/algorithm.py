@@ -1,4 +1,4 @@
-"""What an algorithm of the registry is, and what acts in the end."""
+"""The interface of the registry's algorithms, and the policy that one loads."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Acting:
-    """A policy that is ready but for the gripper and how it moves.
+    """A policy that still needs the gripper's limits and the flow policy's options.
 
     Attributes:
-        name: in tables.
-        policy: makes it, on the CPU.
+        name: the policy's name in tables.
+        policy: makes the policy, on the CPU.
         part_mask_input: whether its network was trained with the mask of the part to open.
-        network: the flow network that is measured besides; None if there is none.
+        network: the flow network whose predictions are measured as well, if it has one.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Acting:
 
 
 class Algorithm(Protocol):
-    """What :mod:`fb3d_rl.registry` names as an algorithm."""
+    """An algorithm of :mod:`fb3d_rl.registry`."""
 
     def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
         """Train on the configured objects and evaluate on the held-out ones; everything is written below ``out``.
@@ -47,7 +47,7 @@ class Algorithm(Protocol):
         ...
 
     def load(self, path: str | Path) -> Acting:
-        """What a checkpoint holds.
+        """Load the policy of a checkpoint.
 
         Raises:
             UserError: the file is missing or no checkpoint of this algorithm.

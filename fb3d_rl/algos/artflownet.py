@@ -1,4 +1,4 @@
-"""algo=artflownet: the paper's network, which predicts the flow."""
+"""algo=artflownet: the paper's network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""DAgger's collection: trials to train on, run by expert and learner, with the expert's label of every step."""
+"""DAgger's collection: rollouts of expert and learner in which the expert labels every step."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ from fb3d_rl.rollout.trials import BARREN, draw_trials
 from fb3d_rl.scene.posed import Posed
 
 STEPS_OF_TRIAL = 60
-"""Labels that a trial is reckoned to bring."""
+"""Labels that a trial is expected to give."""
 
 OUTCOME: tuple[Key, ...] = (*demonstrations.OUTCOME, ("next", "contact"))
-"""What a round's numbers are made of."""
+"""The keys from which a round's numbers are computed."""
 
 EXPERT: tuple[Key, ...] = ("action", ("expert", "action"), ("expert", "acts"), "elapsed_steps")
-"""What a row holds besides what the learner reads and writes."""
+"""The keys of a row that the learner neither reads nor writes."""
 
 
 @dataclass(frozen=True)
 class Round:
-    """What one round collected.
+    """The labelled episodes of one round.
 
     Attributes:
-        episodes: frames [T] with what is known about them; exactly as many as the labels asked for.
-        numbers: "collect/success_rate" and "collect/contact_rate" of the whole episodes, "collect/expert_share" of the
-            labels (see :func:`expert_share`) ...
-        ended: when, on the clock of :func:`time.perf_counter`.
+        episodes: frames [T] and facts of each episode; together exactly as many frames as labels were asked for.
+        numbers: for the log; "collect/success_rate" and "collect/contact_rate" are of whole episodes,
+            "collect/expert_share" is of the labels (see :func:`expert_share`).
+        ended: the time of :func:`time.perf_counter` at the end.
     """
 
     episodes: list[tuple[TensorDictBase, EpisodeInfo]]
@@ -59,27 +59,27 @@ def collect(
     rng: np.random.Generator,
     progress: Callable[[int], None] = lambda labels: None,
 ) -> Round:
-    """Run trials until they have brought ``labels`` labels; the last episode is cut to fit.
+    """Run trials until there are ``labels`` labels; the last episode is cut to fit.
 
     Args:
         workers: environments with an :class:`~fb3d_rl.policies.interaction.InteractivePolicy`.
         views: the objects to train on.
-        samples: clouds and views.
+        samples: how clouds and views are drawn.
         rows: what a row holds.
-        number: of the round.
-        labels: labels to collect.
-        rng: draws the trials.
-        progress: called with the labels so far.
+        number: the number of the round.
+        labels: how many labels to collect.
+        rng: the generator that draws the trials.
+        progress: called with the number of labels so far.
 
     Raises:
-        UserError: many trials in succession crashed or brought no label.
+        UserError: many trials in succession crashed or gave no label.
     """
     categories = {view.obj.id: view.obj.category for view in views}
     episodes: list[tuple[TensorDictBase, EpisodeInfo]] = []
     outcomes: list[tuple[bool, bool]] = []
     count, steps, crashed, barren, error, started = 0, 0, 0, 0, "", time.perf_counter()
     while count < labels:
-        # A number that depends on the labels alone, so that the workers' number decides nothing.
+        # The number of trials depends on the labels only, so that the rows do not depend on the number of workers.
         trials = draw_trials(views, samples, rng, min(48, math.ceil((labels - count) / STEPS_OF_TRIAL)))
         ended: dict[int, TensorDictBase] = {}
         for episode in workers.run(trials, rows.keys()):
@@ -90,7 +90,7 @@ def collect(
             steps += len(episode.frames)
             progress(min(labels, count + sum(map(len, ended.values()))))
         for index, trial in enumerate(trials):
-            barren += 1  # until it brings a label
+            barren += 1  # set to 0 below if the trial gives a label
             if index not in ended:
                 continue
             frames = rows.of(ended[index])
@@ -103,7 +103,7 @@ def collect(
                 episodes.append((kept, info))
                 count += len(kept)
         if barren >= BARREN:
-            raise UserError(f"the last {barren} trials brought no label: {rows.why_none(len(outcomes), error)}")
+            raise UserError(f"the last {barren} trials gave no label: {rows.why_none(len(outcomes), error)}")
     success, contact = np.mean(outcomes, axis=0).tolist()
     ended_at = time.perf_counter()
     seconds = ended_at - started
@@ -123,7 +123,7 @@ def expert_share(rows: Sequence[TensorDictBase]) -> float:
     """Share of the labelled steps that the expert also made.
 
     Args:
-        rows: of episodes [T], as they are in the buffer: what has no label in it does not count.
+        rows: the rows [T] of each episode in the buffer, all of which have a label.
     """
     return float(torch.cat([frames["expert", "acts"] for frames in rows]).double().mean())
 
@@ -133,11 +133,11 @@ class RowsOptions:
     """Which frames and which of their entries become rows.
 
     Attributes:
-        limits: what action 1 means.
-        history: steps that the learner remembers.
-        flow: where it reads a flow.
-        further: what a gate's thresholds are set by.
-        attached_only: whether the learner acts on held parts only, so that the other labels are not asked for.
+        limits: the velocities of action 1.
+        history: number of earlier steps in the learner's input.
+        flow: the key of the flow in the learner's input, if there is one.
+        further: keys from which a gate's thresholds are set.
+        attached_only: whether only steps in which suction holds a part become rows.
     """
 
     limits: VelocityLimits
@@ -147,11 +147,11 @@ class RowsOptions:
     attached_only: bool = False
 
     def keys(self) -> list[Key]:
-        """What the workers have to send."""
+        """The keys that the workers have to send."""
         return [*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
 
     def why_none(self, ended: int, error: str) -> str:
-        """Why trials brought no rows, and what to change, if ``ended`` of a round did not crash with ``error``."""
+        """Why the trials of a round, of which ``ended`` did not crash, gave no rows, and what to change."""
         if not (ended and self.attached_only):
             return f"they crashed, the last one with: {error}"
         return (
@@ -160,7 +160,7 @@ class RowsOptions:
         )
 
     def of(self, frames: TensorDictBase) -> TensorDictBase:
-        """The rows of an episode's frames [T]: with the label as a twist, and what the learner remembers."""
+        """The rows of an episode's frames [T], with the label as a twist and the hand's earlier steps."""
         rows = frames.select(*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further)
         rows["expert", "twist"] = twist_of(rows["observation"], rows["expert", "action"], self.limits)
         if self.history:
@@ -169,10 +169,10 @@ class RowsOptions:
 
 
 def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer, rows: RowsOptions) -> None:
-    """Add all of ``source``'s rows, as the learner takes them.
+    """Add all rows of ``source`` in the layout that the learner reads.
 
     Raises:
-        UserError: they lack what the learner reads.
+        UserError: they lack a key that the learner reads.
     """
     lacking = [key for key in (*OBSERVED, *([rows.flow] if rows.flow else ()), *EXPERT) if key not in source.keys]
     if lacking:
@@ -182,10 +182,10 @@ def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer
 
 
 def relabelled(rows: TensorDictBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
-    """``rows`` [R] with what the learner would do and say there now."""
+    """``rows`` [R] with the actions and predictions of the present learner."""
     parts = []
     for part in rows.split(256):
-        said = policy(part.clone())
-        part["learner", "action"] = said["action"]
-        parts.append(part.update(said.select("learner")))
+        decided = policy(part.clone())
+        part["learner", "action"] = decided["action"]
+        parts.append(part.update(decided.select("learner")))
     return torch.cat(parts)

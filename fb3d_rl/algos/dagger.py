@@ -1,4 +1,4 @@
-"""algo=bc and algo=dagger: in rounds, let expert and learner act, have the expert label every step, fit the learner.
+"""algo=bc and algo=dagger: in each round expert and learner act, the expert labels every step, the learner is fitted.
 
 Behaviour cloning is the case of one round in which the expert always acts.
 """
@@ -32,7 +32,7 @@ from fb3d_rl.algos.learners import (
     networks,
     new_gate,
     new_learner,
-    nth,
+    numbered_seed,
     policy_name,
 )
 from fb3d_rl.algos.weights import CHECKPOINT, load_network, state_before
@@ -70,16 +70,16 @@ BUFFER = "buffer"
 
 @dataclass
 class Progression:
-    """How far a run is: with the rows on disk, all that a resumed run needs.
+    """State of a run; with the rows on disk it is all that a resumed run needs.
 
     Attributes:
-        round: the round in work.
-        collected: rounds whose rows are in the buffer.
-        rows: rows of these rounds.
-        log_rows: lines written to metrics.jsonl.
-        numbers: what the collection of this round showed.
+        round: the current round.
+        collected: number of rounds whose rows are in the buffer.
+        rows: number of rows of these rounds.
+        log_rows: number of lines written to metrics.jsonl.
+        numbers: the collection's numbers of this round.
         fit: state of this round's fit, once it has begun.
-        learner: the weights; while a fit runs, those from before it.
+        learner: the weights; during a fit those from before it.
         gate: the gate's thresholds.
     """
 
@@ -94,14 +94,14 @@ class Progression:
 
 
 class Run:
-    """A run of algo=bc or algo=dagger: what it is made of, and how far it is.
+    """A run of algo=bc or algo=dagger.
 
     Args:
         cfg: the configuration.
         out: the run folder.
 
     Raises:
-        UserError: whatever the configuration can get wrong, before any work.
+        UserError: the configuration cannot be run; raised before any work.
     """
 
     def __init__(self, cfg: TrainConfig, out: Path) -> None:
@@ -128,7 +128,9 @@ class Run:
         limit = algo.validate_trials
         self.validated = setup.load(entries.validation)
         if limit and not self.validated:
-            raise UserError(f"algo.validate_trials={limit} needs validation objects: more assets.validation_share")
+            raise UserError(
+                f"algo.validate_trials={limit} needs validation objects; give a larger assets.validation_share"
+            )
         self.validation = schedule(self.validated, self.protocol.samples, cfg.seed, limit)[0] if limit else []
         if saved is None:
             self.done = Progression()
@@ -139,7 +141,7 @@ class Run:
             self.buffer = self.kept_buffer()
 
     def new_buffer(self, given: DemonstrationBuffer | None) -> DemonstrationBuffer:
-        """A buffer for the run's labels, which begins with the demonstrations that are given."""
+        """A buffer for the run's labels that starts with the given demonstrations."""
         if self.cfg.resume:
             shutil.rmtree(self.out / BUFFER, ignore_errors=True)
         rows = self.cfg.data.labels + (len(given) if given else 0)
@@ -151,7 +153,7 @@ class Run:
         return buffer
 
     def restored(self, state: dict[str, Any]) -> Progression:
-        """How far the run was; learner and gate are as they were then."""
+        """The saved state; learner and gate get their saved weights."""
         with fitting(self.out / CHECKPOINT):
             done = Progression(**state)
             networks(self.learner).load_state_dict(done.learner)
@@ -162,15 +164,15 @@ class Run:
         return done
 
     def kept_buffer(self) -> DemonstrationBuffer:
-        """The buffer with the rows that the checkpoint knows of.
+        """The buffer, cut to the rows that the checkpoint counts.
 
         Raises:
-            UserError: it has lost some.
+            UserError: it has fewer.
         """
         buffer, rows = DemonstrationBuffer.open(self.out / BUFFER), self.done.rows
         if len(buffer) < rows:
             raise UserError(
-                f"{self.out / BUFFER} holds {len(buffer)} of the {rows} rows that {CHECKPOINT} knows of; "
+                f"{self.out / BUFFER} holds {len(buffer)} of the {rows} rows that {CHECKPOINT} counts; "
                 "copy the run folder anew, or start a new run"
             )
         buffer.truncate(rows)
@@ -214,7 +216,7 @@ class Run:
             pending: Future[Round] | None = None
 
             def begin(number: int) -> partial[Round]:
-                """The collection of a round, ready to run beside anything else."""
+                """Prepare a round's collection, which may run in another thread."""
                 self.set_gate(number)
                 workers.update_policy_weights_()
                 labels = share(self.cfg.data.labels, algo.rounds, number)
@@ -228,19 +230,19 @@ class Run:
                 number = done.round
                 if done.collected == number:
                     started = time.perf_counter()
-                    found = pending.result() if pending else begin(number)()
+                    collected = pending.result() if pending else begin(number)()
                     waited = time.perf_counter() - started
                     pending = None
-                    for frames, info in found.episodes:
+                    for frames, info in collected.episodes:
                         self.buffer.extend(frames, info)
                     self.buffer.commit()
                     done.rows, done.collected = len(self.buffer), number + 1
-                    done.numbers = found.numbers | {"time/waited_for_labels": waited}
-                    if beside is not None and number + 1 < algo.rounds:  # how long the environments stood still
-                        done.numbers["time/waited_for_training"] = time.perf_counter() - found.ended
+                    done.numbers = collected.numbers | {"time/waited_for_labels": waited}
+                    if beside is not None and number + 1 < algo.rounds:  # how long no environment ran
+                        done.numbers["time/waited_for_training"] = time.perf_counter() - collected.ended
                     self.save()
                 if beside is not None and number + 1 < algo.rounds:
-                    # The next round runs while this one is fitted, with the weights from before.
+                    # The next round is collected while this one is fitted, with the weights from before the fit.
                     pending = beside.submit(begin(number + 1))
                 self.fit(number, log)
                 numbers = self.validate()
@@ -250,7 +252,7 @@ class Run:
                 self.save()
 
     def set_gate(self, number: int) -> None:
-        """Set who acts in a round."""
+        """Set how the gate decides who acts in a round."""
         for gate in self.policy.gate.modules():
             if isinstance(gate, BetaGate):
                 gate.beta.fill_(round_beta(self.algo, number))
@@ -260,7 +262,7 @@ class Run:
             self.policy.gate.tune(relabelled(rows, self.learner), self.algo.gate.budget)
 
     def fit(self, number: int, log: RunLog) -> None:
-        """Fit the learner to all rows; saves the run now and then."""
+        """Fit the learner to all rows; checkpoints are saved meanwhile."""
         done, before = self.done, self.steps_before(number)
         options = fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, number)
 
@@ -271,7 +273,7 @@ class Run:
         nets = networks(self.learner).to(self.protocol.device)
         objective = imitation_objective(self.learner, self.algo, options.seed)
         labels = Labels(self.buffer, self.algo.learner.chunk)
-        # Threads that wait for each other on cores that collect would slow both down many times.
+        # One thread: several would wait for each other on cores that also collect, and slow both down many times.
         with steady_floats() if self.algo.overlap else nullcontext():
             fit(nets, labels, options, objective=objective, device=self.protocol.device, on_checkpoint=checkpoint,
                 resume=done.fit, log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
@@ -279,7 +281,7 @@ class Run:
         nets.to("cpu")
 
     def validate(self) -> dict[str, float]:
-        """What the learner opens of a few validation objects."""
+        """The learner's success and contact rate on a few validation objects."""
         if not self.validation:
             return {}
         objects = [obj for obj, _ in self.validated]
@@ -297,12 +299,12 @@ class Run:
 
     @property
     def labels(self) -> int:
-        """The expert's labels in the buffer; demonstrations that were given are not counted."""
+        """Number of the expert's labels in the buffer, without the given demonstrations."""
         return sum(share(self.cfg.data.labels, self.algo.rounds, i) for i in range(self.done.collected))
 
     @property
     def expert_share(self) -> float:
-        """See :func:`~fb3d_rl.algos.collection.expert_share`; demonstrations that were given are not counted."""
+        """See :func:`~fb3d_rl.algos.collection.expert_share`; without the given demonstrations."""
         return expert_share([self.buffer.frames(i) for i in range(self.given, len(self.buffer.episodes))])
 
 
@@ -323,11 +325,11 @@ class Imitation:
     def load(self, path: str | Path) -> Acting:
         """See :class:`~fb3d_rl.algos.algorithm.Algorithm`.
 
-        The policy raises a UserError if its learner was trained on a gripper to which an action means something else:
-        what it remembers and plans is counted in control steps.
+        The policy raises a UserError if its learner was trained with other limits or another control rate: its history
+        and its plans are counted in control steps.
         """
         saved = load_checkpoint(path)
-        if REGISTRY.get(saved["algo"]) is not REGISTRY["dagger"]:  # bc's is the same
+        if REGISTRY.get(saved["algo"]) is not REGISTRY["dagger"]:  # bc has the same entry
             raise UserError(f"{path} is a checkpoint of {saved['algo']}, not of bc or dagger: choose another file.")
         with fitting(path):
             kwargs, state = saved["model_kwargs"], saved["state"]
@@ -340,13 +342,13 @@ class Imitation:
             networks(learner).load_state_dict(state["model"])
             name, oracle = kwargs["name"], kwargs["oracle"]
 
-        def policy(wanted: VelocityLimits, options: FlowPolicyOptions) -> TensorDictModuleBase:
-            if limits != wanted:
+        def policy(present: VelocityLimits, options: FlowPolicyOptions) -> TensorDictModuleBase:
+            if limits != present:
                 raise UserError(
                     f"{path} was trained with env.gripper.v_max={limits.linear:g} "
                     f"env.gripper.w_max={limits.angular:g} env.control_freq={1 / limits.period:g}; give the same"
                 )
-            return acting_policy(expert_policy(wanted, options), learner, oracle)
+            return acting_policy(expert_policy(present, options), learner, oracle)
 
         return Acting(name, policy)
 
@@ -355,7 +357,7 @@ ALGORITHM = Imitation()
 
 
 def round_beta(algo: ImitationOptions, number: int) -> float:
-    """The expert's share in a round; all of it in the first one, before the learner has learned anything."""
+    """The expert's share of a round's steps; 1 in the first round, since the learner is untrained."""
     if number == 0:
         return 1.0
     return beta(algo.beta.schedule, number, algo.beta.value, algo.beta.rounds, algo.beta.base)
@@ -369,8 +371,8 @@ def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> 
 
 
 def fit_options(algo: ImitationOptions, labels: int, seed: int, number: int) -> FitOptions:
-    """How the learner is fitted in a round: its share of the steps, with a learning rate that rises and falls."""
-    return taken(FitOptions, algo, steps=round_steps(algo, labels, number), seed=nth(seed, "round", number))
+    """How the learner is fitted in a round; each round has a warm-up and a decay of the learning rate."""
+    return taken(FitOptions, algo, steps=round_steps(algo, labels, number), seed=numbered_seed(seed, "round", number))
 
 
 def round_steps(algo: ImitationOptions, labels: int, number: int) -> int:
@@ -380,5 +382,5 @@ def round_steps(algo: ImitationOptions, labels: int, number: int) -> int:
 
 
 def share(total: int, rounds: int, number: int) -> int:
-    """What round ``number`` of ``rounds`` has of a total; the first ones have the remainder."""
+    """The part of a total that round ``number`` of ``rounds`` has; the first rounds share the remainder."""
     return total // rounds + (number < total % rounds)

@@ -1,6 +1,6 @@
-"""Draw flow samples, fit a network to them, then measure it and let it open things: algo=artflownet, screwnet, ump_di.
+"""Draw flow samples, fit a network to them, measure it, and evaluate its policy: algo=artflownet, screwnet, ump_di.
 
-What these do not share stands in a :class:`FlowNetwork` each, in the module of that name.
+Each algorithm is a :class:`FlowNetwork` in the module of its name, which holds what they do not share.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorDictReplayBuffer, TensorStorage
 
 from fb3d_rl.algos import setup
-from fb3d_rl.algos.aggregation import meet_samples
+from fb3d_rl.algos.aggregation import rollout_samples
 from fb3d_rl.algos.algorithm import Acting
 from fb3d_rl.algos.weights import BEST, CHECKPOINT, best_cosine, load_network, load_trained, state_before
 from fb3d_rl.assets.catalog import Entry
@@ -57,10 +57,10 @@ SAMPLES = "samples"
 VALIDATION_SAMPLES = 64
 
 MET = "met"
-"""The clouds that the policy of data.met_by met."""
+"""The clouds of the rollouts of data.met_by."""
 
 Measure: TypeAlias = "Callable[[CloudNetwork, TensorDictBase, torch.device], dict[str, Tensor]]"
-"""Numbers of samples [S], each [S], "cosine" among them: in validation the network with the largest is the best."""
+"""Metrics of samples [S], each [S]; validation keeps the weights with the largest "cosine"."""
 
 
 def flow_numbers(net: CloudNetwork, samples: TensorDictBase, device: torch.device) -> dict[str, Tensor]:
@@ -74,11 +74,11 @@ class FlowNetwork:
     """The algorithm (:class:`~fb3d_rl.algos.algorithm.Algorithm`) of a network that is trained on flow samples.
 
     Attributes:
-        network: the class.
-        policy: of a network on the CPU.
-        objective: what is minimized; None for the loss of the flow.
-        measure: in validation.
-        flow: whether the network answers the flow of a whole cloud.
+        network: the network's class.
+        policy: makes the policy of a network on the CPU.
+        objective: the loss to minimize; None for that of the flow.
+        measure: computes the metrics of validation.
+        flow: whether the network predicts the flow of a whole cloud.
     """
 
     network: type[CloudNetwork]
@@ -88,7 +88,7 @@ class FlowNetwork:
     flow: bool = True
 
     def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
-        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`; no rows in the processes that only fit beside the first."""
+        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`; only the first process returns rows."""
         if rank_and_count()[0]:
             assist(self, cfg, out)
             return []
@@ -99,14 +99,14 @@ class FlowNetwork:
         return self.acting(load_trained(path, self.network))
 
     def acting(self, net: CloudNetwork) -> Acting:
-        """What acts with a network."""
+        """The policy of a network."""
         policy = partial(self.policy, net)
         return Acting(self.network.NAME, policy, net.part_mask_input, net if self.flow else None)
 
 
 def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
     """Train on the configured objects and evaluate on the held-out ones."""
-    # Whatever the configuration can get wrong shows here, before any work.
+    # All errors of the configuration are raised here, before any work.
     protocol = setup.protocol(cfg, cfg.resume)
     device = protocol.device
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
@@ -129,7 +129,7 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
     else:
         draw_samples(cfg, [entry.folder for entry in entries.train], protocol.samples, out / SAMPLES)
     if met_by is not None:
-        meet(cfg, out, met_by, entries.train, protocol)
+        draw_rollout_samples(cfg, out, met_by, entries.train, protocol)
     wait_for_all()
     buffer = training_rows(cfg, out)
     validation = validation_samples(entries.validation, protocol.samples, cfg.seed)
@@ -154,9 +154,9 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
 def validate(
     kind: FlowNetwork, samples: TensorDictBase | None, device: torch.device, best: Path, seed: int, measured: nn.Module
 ) -> dict[str, float]:
-    """Numbers of a network on the validation objects, whose weights are kept in the file ``best`` if they are that.
+    """Metrics of a network on the validation objects; the file ``best`` keeps the weights with the largest cosine.
 
-    Nothing that is evaluated in the end is looked at before.
+    The objects of the final evaluation are not used here.
     """
     if samples is None:
         return {}
@@ -169,7 +169,7 @@ def validate(
 
 
 def require_products(options: FitOptions, device: torch.device) -> None:
-    """Check that the device can compute as the options say, and note where it is slow at it.
+    """Check that the device can compute as the options say, and print a note where it is slow.
 
     Raises:
         UserError: there is no compiler.
@@ -182,20 +182,22 @@ def require_products(options: FitOptions, device: torch.device) -> None:
         )
 
 
-def meet(cfg: TrainConfig, out: Path, met_by: ArtFlowNet, train: list[Entry], protocol: Protocol) -> None:
-    """Let an ArtFlowNet's policy meet clouds of the training objects, with a progress bar."""
+def draw_rollout_samples(
+    cfg: TrainConfig, out: Path, met_by: ArtFlowNet, train: list[Entry], protocol: Protocol
+) -> None:
+    """Draw clouds from rollouts of an ArtFlowNet's policy with the training objects, with a progress bar."""
     loaded, count = [entry.load() for entry in train], cfg.data.met_samples
     own = setup.settled(replace(cfg, policy=replace(cfg.policy, mask=None)), met_by.part_mask_input)
     speeds, meeting = setup.flow_policy_options(own), replace(protocol, env=setup.env_options(own))
     acting = artflownet_policy(met_by, setup.velocity_limits(cfg), speeds)
     made_by = {"weights": met_by.digest(), "policy": asdict(speeds)}
     with progress_bars() as bar:
-        task = bar.add_task("clouds met", total=count)
-        meet_samples(out / MET, loaded, acting, count, meeting, made_by, lambda n: bar.update(task, completed=n))
+        task = bar.add_task("rollout clouds", total=count)
+        rollout_samples(out / MET, loaded, acting, count, meeting, made_by, lambda n: bar.update(task, completed=n))
 
 
 def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:
-    """Samples of the validation objects, some ``VALIDATION_SAMPLES`` in all; None where there is no object."""
+    """About ``VALIDATION_SAMPLES`` samples of the validation objects; None if none of them can be opened."""
     objects = setup.load(entries)
     if not any(openable_links(obj) for obj, _ in objects):
         return None
@@ -204,12 +206,12 @@ def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) 
 
 
 def require_unseen(dataset: Path, entries: list[Entry]) -> None:
-    """Check that a whole data set of another run holds none of the objects that this one validates and evaluates on.
+    """Check that another run's data set has none of the objects that this run validates or evaluates on.
 
     Raises:
         UserError: it does.
     """
-    # Earlier versions kept folders in place of ids with digests.
+    # Recipes of version 1 list folders, later ones ids with digests.
     drawn = {Path(item).name if isinstance(item, str) else item[0] for item in recipe_of(dataset)["objects"]}
     seen = sorted(entry.id for entry in entries if entry.id in drawn)
     if seen:
@@ -220,7 +222,7 @@ def require_unseen(dataset: Path, entries: list[Entry]) -> None:
 
 
 def assist(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> None:
-    """Fit beside the first of several processes, which does all the rest, once the samples are there."""
+    """What the other of several processes do: wait until the first has drawn the samples, then fit with it."""
     device, options = setup.choose_device(cfg.device), fit_options(cfg)
     resume = state_before(cfg, out)
     net = new_network(kind, cfg)
@@ -238,7 +240,7 @@ def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, 
 
 
 def training_rows(cfg: TrainConfig, out: Path) -> Joined:
-    """What is trained on: flow samples, and behind them what a policy met."""
+    """The training samples: drawn ones, then those of rollouts."""
     folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
     parts = [load_samples(folder) for folder in folders]
     return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(part)) for part in parts))
@@ -248,21 +250,23 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     """How the network is fitted.
 
     Raises:
-        UserError: the batch cannot be shared out to the processes that fit together.
+        UserError: the batch size is no multiple of the number of processes that fit together.
     """
     algo, processes = cast("FlowNetworkOptions", cfg.algo), rank_and_count()[1]
     if algo.batch_size % processes:
-        raise UserError(f"algo.batch_size={algo.batch_size} cannot be shared out to {processes} processes equally")
+        raise UserError(
+            f"algo.batch_size={algo.batch_size} cannot be split equally among {processes} processes; give a multiple"
+        )
     rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
     rows += cfg.data.met_samples if cfg.data.met_by else 0
     return taken(FitOptions, algo, steps=math.ceil(algo.epochs * rows / algo.batch_size), seed=cfg.seed)
 
 
 def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
-    """The network to train: its weights depend on the seed alone, or are those of ``algo.start_from``.
+    """The network to train: its first weights are drawn from the seed or read from ``algo.start_from``.
 
     Raises:
-        UserError: these are another network's, or it cannot propose several flows.
+        UserError: the file holds another kind of network, or one that cannot propose several flows.
     """
     algo = cast("FlowNetworkOptions", cfg.algo)
     generator = torch.Generator().manual_seed(cfg.seed)

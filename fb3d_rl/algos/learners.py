@@ -1,4 +1,4 @@
-"""What imitation trains: learners, the buffer's rows as their loss takes them, and the loss."""
+"""What imitation trains: the learners, the training rows and the loss."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ from fb3d_rl.training.objective import Objective
 if TYPE_CHECKING:
     from fb3d_rl.algos.options import ImitationOptions
 
-# TorchRL 0.14.1 says so of its own BCLoss, in which it left out two annotations.
+# TorchRL 0.14.1 warns so about its own BCLoss, in which two annotations are missing.
 warnings.filterwarnings("ignore", message="The name target_actor_network_params wasn't part")
 TURN = 4
 """Purpose of random draws; see :func:`fb3d_rl.training.draws.generator`."""
 
 
 class Labels:
-    """The buffer's rows as the loss takes them: with the expert's twists of ``chunk`` steps as "twist" and "is_pad".
+    """The buffer's rows for the loss: with "twist", the expert's twists of the next ``chunk`` steps, and "is_pad".
 
-    A plan that outlasts its episode is padded; the padding is no part of the loss.
+    Where the episode ends earlier, the twists are padded; the loss leaves the padding out.
     """
 
     def __init__(self, buffer: DemonstrationBuffer, chunk: int) -> None:
@@ -65,16 +65,16 @@ class Labels:
 def new_learner(
     options: LearnerOptions, limits: VelocityLimits, members: int, seed: int, flow_net: ArtFlowNet | None = None
 ) -> Learner | Ensemble:
-    """A learner, or an ensemble of several, with first weights that depend on the seed alone."""
+    """A learner, or an ensemble of several, with first weights that depend on the seed only."""
     each = [
-        Learner(options, limits, torch.Generator().manual_seed(nth(seed, "member", k)), flow_net).eval()
+        Learner(options, limits, torch.Generator().manual_seed(numbered_seed(seed, "member", k)), flow_net).eval()
         for k in range(members)
     ]
     return each[0] if members == 1 else Ensemble(each)
 
 
-def nth(seed: int, what: str, number: int) -> int:
-    """The seed of member or round ``number``: the run's own for the first, else one that no other run has."""
+def numbered_seed(seed: int, what: str, number: int) -> int:
+    """The seed of member or round ``number``: the run's own for number 0, else one derived from it."""
     return derived(seed, what, number) if number else seed
 
 
@@ -84,7 +84,7 @@ def members(learner: Learner | Ensemble) -> list[Learner]:
 
 
 def networks(learner: Learner | Ensemble) -> nn.ModuleList:
-    """What is trained of the learner."""
+    """The trainable networks of the learner."""
     return nn.ModuleList(member.network for member in members(learner))
 
 
@@ -94,7 +94,7 @@ def flow_network(learner: Learner | Ensemble) -> ArtFlowNet | None:
 
 
 def acting_policy(expert: FlowPolicy, learner: Learner | Ensemble, oracle: bool) -> TensorDictModuleBase:
-    """The policy that is evaluated: the learner alone, or with an oracle that drives to the contact point."""
+    """The policy that is evaluated: the learner, or learner and oracle, which drives to the contact point."""
     learner.eval()
     return InteractivePolicy(expert, learner, OracleGate()) if oracle else learner
 
@@ -107,7 +107,7 @@ def policy_name(algo: ImitationOptions) -> str:
 
 
 def new_gate(algo: ImitationOptions) -> Gate:
-    """Who acts while labels are collected: the gate, beside it the schedule's share of the expert, and the oracle."""
+    """The gate of the collection: the expert acts if beta's schedule, ``algo.gate`` or the oracle wants it."""
     mixture = BetaGate(per_step=algo.beta.mixing == "step")
     gates: list[Gate] = [mixture]
     if algo.gate.name != "beta":
@@ -118,34 +118,36 @@ def new_gate(algo: ImitationOptions) -> Gate:
 
 
 def learner_options(algo: ImitationOptions) -> LearnerOptions:
-    """The learner's network; it predicts its distance from the expert if the gate asks for that."""
+    """The learner's options; it predicts its distance from the expert if the gate reads that."""
     return replace(algo.learner, discrepancy=PREDICTED in new_gate(algo).in_keys)
 
 
 def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, seed: int) -> Objective:
-    """TorchRL's BCLoss of every member on situations that are rotated and mirrored at random.
+    """TorchRL's BCLoss of every member on inputs that are rotated and mirrored at random.
 
-    A member that predicts its distance from the expert learns that too; it is taken between twists, which are
-    normalised as actions are.
+    A member that predicts its distance from the expert is also fitted to that: the norm of the difference between the
+    normalised twists of the first step.
     """
     losses = []
     for member in members(learner):
         loss = BCLoss(member.actor(), loss_function=None if algo.learner.head == "gaussian" else algo.loss)
         loss.set_keys(action="twist", pad_mask=None if algo.learner.head == "gaussian" else "is_pad")
         losses.append(loss)
-    most = math.radians(algo.turn)
+    largest = math.radians(algo.turn)
 
     def objective(rows: TensorDictBase, step: int) -> Tensor:
         values = []
         for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
-            draws = torch.rand(2, len(rows), generator=generator(nth(seed, "member", k), TURN, step)).to(rows.device)
+            draws = torch.rand(2, len(rows), generator=generator(numbered_seed(seed, "member", k), TURN, step)).to(
+                rows.device
+            )
             mirrored = (draws[1] < 0.5) & algo.mirror
-            inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * most, mirrored)
+            inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * largest, mirrored)
             inputs["twist"], inputs["is_pad"] = twist, rows["is_pad"]
             values.append(loss(inputs)["loss_bc"])
             if member.options.discrepancy:
-                said, *_, distance = member.network(*(inputs[key] for key in INPUTS))
-                true = (said[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
+                mean, *_, distance = member.network(*(inputs[key] for key in INPUTS))
+                true = (mean[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
                 values.append(nn.functional.smooth_l1_loss(distance, true, beta=0.1))
         return torch.stack(values).mean()
 

@@ -20,21 +20,25 @@ class AlgoOptions:
 
 @dataclass(frozen=True)
 class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
-    """A network that flow samples train, and how."""
+    """A network that is trained on flow samples."""
 
     epochs: float = option(
         1.5,
-        "how often each training sample is drawn; times data.train_samples / batch_size it is the steps",
+        "passes over the training samples; steps = epochs * data.train_samples / batch_size",
         within="(0, inf)",
     )
-    start_from: str | None = option(None, "the weights to start from, a checkpoint.pt or .safetensors; null draws them")
-    backbone: Literal["pointnet2", "delayed"] = option("pointnet2", "the paper's, or one that is several times as fast")
-    neighbors: int = option(64, "points kept in a ball", within="[1, inf)")
-    part_mask_input: bool = option(True, "whether the network sees which points are on the part to open")
+    start_from: str | None = option(
+        None, "weights to start from, a checkpoint.pt or .safetensors; null: random weights"
+    )
+    backbone: Literal["pointnet2", "delayed"] = option(
+        "pointnet2", "the paper's network, or one that is several times as fast"
+    )
+    neighbors: int = option(64, "largest number of points in a ball of PointNet++", within="[1, inf)")
+    part_mask_input: bool = option(True, "whether the mask of the part to open is an input of the network")
     hypotheses: int = option(
         1,
-        "flows that ArtFlowNet proposes for each cloud, each with a probability: sight alone does not tell which way a "
-        "closed lid or a lever goes; 1 is the paper's",
+        "flows that ArtFlowNet proposes for each cloud, each with a probability, as sight alone does not tell which "
+        "way a closed lid or a lever goes; 1 is the paper's network",
         within="[1, inf)",
     )
 
@@ -43,39 +47,43 @@ class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
 class BetaOptions:
     """The expert's share of a round's steps; in the first round it is 1."""
 
-    schedule: Schedule = option("exponential", "first is 1, then 0")
-    value: float = option(0.5, "of constant", within="[0, 1]")
-    rounds: int = option(4, "linear reaches 0 in this one")
-    base: float = option(0.7, "of exponential", within="[0, 1]")
-    mixing: Literal["step", "episode"] = option("episode", "who acts is drawn for every step or once for an episode")
+    schedule: Schedule = option("exponential", "how the share falls; first: 1 in the first round, then 0")
+    value: float = option(0.5, "the share of schedule=constant", within="[0, 1]")
+    rounds: int = option(4, "the round in which schedule=linear reaches 0")
+    base: float = option(0.7, "the share of round n is base^n with schedule=exponential", within="[0, 1]")
+    mixing: Literal["step", "episode"] = option(
+        "episode", "whether who acts is drawn for every step or once for an episode"
+    )
 
 
 @dataclass(frozen=True)
 class ImitationOptions(OptimizerOptions, AlgoOptions):
     """Behaviour cloning and DAgger."""
 
-    rounds: int = option(8, "how often is collected and fitted", within="[1, inf)")
+    rounds: int = option(8, "number of rounds; each collects labels and fits the learner", within="[1, inf)")
     epochs: float = option(
         20.0,
-        "draws per label in all rounds; times data.labels / batch_size it is the steps, which the rounds share",
+        "draws of each label in all rounds together; steps = epochs * data.labels / batch_size, shared by the rounds",
         within="(0, inf)",
     )
     beta: BetaOptions = group(BetaOptions)
     gate: GateOptions = group(GateOptions)
-    oracle: bool = option(False, "the expert drives to the contact point, the learner acts on held parts alone")
-    members: int = option(1, "learners of an ensemble", within="[1, inf)")
+    oracle: bool = option(False, "the expert drives to the contact point; the learner acts while suction holds a part")
+    members: int = option(1, "number of learners; several are an ensemble", within="[1, inf)")
     learner: LearnerOptions = group(LearnerOptions)
-    flow_checkpoint: str | None = option(None, "an ArtFlowNet's checkpoint.pt, for learner.flow=artflownet")
+    flow_checkpoint: str | None = option(None, "an ArtFlowNet's checkpoint.pt, with learner.flow=artflownet")
     demonstrations: str | None = option(
-        None, "a buffer that launch/demos.py recorded, imported or filtered, to start from"
+        None, "demonstrations to start from: a buffer that launch/demos.py recorded, imported or filtered"
     )
     overlap: bool = option(
         False,
-        "collect each next round on all cores but one while the last one is fitted, with the weights from before",
+        "collect the next round during the fit of this one, on all cores but one, with the weights from before the fit",
     )
     validate_trials: int = option(
         0, "trials with validation objects after each round, for the learning curve", within="[0, inf)"
     )
-    loss: Literal["l1", "l2", "smooth_l1"] = option("l1", "of a deterministic head; the Gaussian's is its likelihood")
-    turn: float = option(15.0, "situations are turned about z by up to so much, at random", "degrees", "[0, inf)")
-    mirror: bool = option(True, "every other situation is mirrored, at random")
+    loss: Literal["l1", "l2", "smooth_l1"] = option(
+        "l1", "loss of a deterministic head; a Gaussian head has its likelihood"
+    )
+    turn: float = option(15.0, "inputs are rotated about z by a random angle of at most this", "degrees", "[0, inf)")
+    mirror: bool = option(True, "mirror inputs with probability 1/2")

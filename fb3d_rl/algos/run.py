@@ -1,4 +1,4 @@
-"""Train or evaluate what the configuration names of the registry; what launch/train.py and launch/evaluate.py do."""
+"""Train or evaluate the registry's entry that the configuration names: launch/train.py and launch/evaluate.py."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run_training(cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
 
 def acting(name: str, checkpoint: str | None) -> Acting:
-    """The policy of that name; one that is trained is loaded.
+    """The policy of that name; a trained one is loaded from its checkpoint.
 
     Raises:
         UserError: the checkpoint is missing or of another algorithm.
@@ -36,12 +36,12 @@ def acting(name: str, checkpoint: str | None) -> Acting:
 
 
 def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
-    """Evaluate the configured policy, beside the expert if that is asked for.
+    """Evaluate the configured policy, and the expert if evaluation.expert says so.
 
     Returns:
         One row for each scheduled trial and policy.
     """
-    setup.choose_device(cfg.device)  # one that is not there shows before anything is read
+    setup.choose_device(cfg.device)  # a missing device is an error before anything is read
     chosen = acting(cfg.policy.name, cfg.checkpoint)
     cfg = setup.settled(cfg, chosen.part_mask_input)
     protocol = setup.protocol(cfg, cfg.resume)

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from tensordict import TensorDictBase
 
 UNEXPLAINED = 0.05
-"""What one screw may leave of a flow (root mean square) that it is a label of; flows of several joints leave more."""
+"""Largest residual (root mean square) of a flow that one screw explains; flows of several joints leave more."""
 
 NARROW = 0.05
-"""The least distance (m) from the axis in which an error of the axis' place is measured."""
+"""Smallest size (m) of a part to which an error of the axis' position is relative."""
 
 
 def screw_loss(votes: tuple[Tensor, Tensor, Tensor], target: JointScrew, points: Tensor, part: Tensor) -> Tensor:
@@ -40,7 +40,7 @@ def screw_loss(votes: tuple[Tensor, Tensor, Tensor], target: JointScrew, points:
         votes: of :meth:`ScrewNet.votes`, [B, N, ...].
         target: [B].
         points: [B, N, 3] m.
-        part: [B, N] bool, the points that count.
+        part: [B, N] bool, the points of the part.
     """
     turns, axis, origin = votes
     revolute = target.revolute[:, None].expand_as(turns).to(turns.dtype)

@@ -48,7 +48,7 @@ Config = TypeVar("Config", bound="CommandConfig")
 
 @dataclass(frozen=True)
 class TrainEntries:
-    """The objects of a training run, none of them twice: to train on, to validate on meanwhile, to evaluate on."""
+    """The objects of a training run in three disjoint lists: for training, validation and evaluation."""
 
     train: list[Entry]
     validation: list[Entry]
@@ -56,7 +56,7 @@ class TrainEntries:
 
 
 def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
-    """The objects that training is about."""
+    """The objects of a training run."""
     made = _made(assets, out, seed, assets.train_count)
     train = [entry for entry in made if entry.split == "train_train"]
     held_out = [entry for entry in made if entry.split != "train_train"]
@@ -65,7 +65,7 @@ def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
         held_out = partnet_catalog(assets.root, assets.eval_split, assets.split_file) + _beside_real(held_out)
     kept = validation_ids({entry.id: entry.category for entry in train}, assets.validation_share)
     if assets.validation_share and not kept:
-        print("note: too few training objects to keep one for validation; nothing is validated while training")
+        print("note: too few training objects to keep one for validation; there is no validation during training")
     return TrainEntries(
         [entry for entry in train if entry.id not in kept], [entry for entry in train if entry.id in kept], held_out
     )
@@ -80,7 +80,7 @@ def eval_entries(assets: AssetsOptions, out: Path, seed: int) -> list[Entry]:
 
 
 def _made(assets: AssetsOptions, out: Path, seed: int, train_count: int) -> list[Entry]:
-    """The procedural objects, if there are to be any."""
+    """The procedural objects, if the configuration has any."""
     if assets.source != "procedural" and not (assets.categories or assets.unseen_categories):
         return []
     return procedural_catalog(
@@ -89,7 +89,7 @@ def _made(assets: AssetsOptions, out: Path, seed: int, train_count: int) -> list
 
 
 def _beside_real(entries: list[Entry]) -> list[Entry]:
-    """The same with splits of their own, so that no number mixes them with PartNet-Mobility's."""
+    """The same entries under other split names, so that no mean mixes them with PartNet-Mobility's."""
     return [replace(entry, split=f"procedural_{entry.split}") for entry in entries]
 
 
@@ -97,7 +97,7 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
     """The object that ``cfg.object`` names; a procedural one is made below ``out``.
 
     Raises:
-        UserError: it names none, or a folder of several.
+        UserError: it names no object, or a folder of several.
     """
     word = None if cfg.object is None else str(cfg.object)
     if word is not None and Path(word).expanduser().is_dir():
@@ -109,7 +109,7 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
             )
         return entries[0].load()
     if cfg.assets.source == "procedural":
-        if word in procedural.FAMILIES:  # whether it is among assets.categories or not
+        if word in procedural.FAMILIES:  # also if assets.categories leaves it out
             return procedural_catalog(out, [word], 0, 1, cfg.seed)[0].load()
         return entry_of(eval_entries(cfg.assets, out, cfg.seed), word).load()
     return entry_of(folder_entries(cast(str, cfg.assets.root)), word).load()
@@ -121,7 +121,7 @@ def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
 
 
 def sample_options(cfg: CommandConfig) -> SampleOptions:
-    """How clouds are taken: ray-cast, whatever the task sees with."""
+    """How flow samples are drawn: always ray-cast, also where the task renders with SAPIEN."""
     optics = CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
     return replace(taken(SampleOptions, cfg.data), views=taken(ViewRange, cfg.camera), camera=optics)
 
@@ -131,8 +131,8 @@ def settled(cfg: Config, part_mask_input: bool | None = None) -> Config:
 
     Args:
         cfg: the configuration.
-        part_mask_input: whether the network that acts was trained with the mask; None for the one that ``cfg`` trains,
-            if it does.
+        part_mask_input: whether the acting network was trained with the mask; None for the network that ``cfg`` trains,
+            if there is one.
     """
     if part_mask_input is None:
         part_mask_input = getattr(getattr(cfg, "algo", None), "part_mask_input", True)
@@ -148,22 +148,22 @@ def env_options(cfg: CommandConfig) -> EnvOptions:
 
 
 def flow_policy_options(cfg: CommandConfig) -> FlowPolicyOptions:
-    """Speeds, distances and times of the flow policy, and the mask that it sees."""
+    """The options of the flow policy, with the mask that it gets."""
     policy = settled(cfg).policy
     assert policy.mask is not None
     return replace(policy.flow, mask=policy.mask, contact=policy.contact)
 
 
 def velocity_limits(cfg: CommandConfig) -> VelocityLimits:
-    """What an action means for the gripper."""
+    """The gripper's velocities at action 1."""
     return limits_of(env_options(cfg))
 
 
 def protocol(cfg: CommandConfig, resume: bool = False) -> Protocol:
-    """What is evaluated, going on from the run folder's rows or not.
+    """The settings of the evaluation; with ``resume`` it keeps the run folder's rows.
 
     Raises:
-        UserError: there is no such device; there are trials to run, but no simulator, or videos to make, but no ffmpeg.
+        UserError: the device is missing, or the simulator (for trials), or ffmpeg (for videos).
     """
     device = choose_device(cfg.device)
     if cfg.evaluation.trials != 0:
@@ -199,8 +199,8 @@ def choose_device(name: str) -> torch.device:
 
 def collector_options(cfg: CommandConfig, spare: int = 0) -> CollectorOptions:
     """Where trials run, on all cores but ``spare`` unless the configuration names a number of workers."""
-    named: int | None = cfg.collector.workers  # null until here
-    return replace(cfg.collector, workers=max(1, workers(None) - spare) if named is None else named)
+    count: int | None = cfg.collector.workers  # null in a configuration
+    return replace(cfg.collector, workers=max(1, workers(None) - spare) if count is None else count)
 
 
 def workers(count: int | None) -> int:
@@ -209,7 +209,7 @@ def workers(count: int | None) -> int:
 
 
 def facts(cfg: CommandConfig, trained_on: Sequence[Entry] = ()) -> dict[str, Any]:
-    """What summary.json says about a run besides its numbers."""
+    """The facts about a run that summary.json lists besides the metrics."""
     lost = lost_geometry(entry.known for entry in trained_on if entry.known is not None)
     return {
         **({LOST_GEOMETRY: lost} if lost else {}),

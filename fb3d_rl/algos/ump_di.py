@@ -1,4 +1,4 @@
-"""algo=ump_di: what DirectionNet is fitted to, and how good its directions are."""
+"""algo=ump_di: the loss of DirectionNet, and the metric of its directions."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from fb3d_rl.training.objective import Objective
 from fb3d_rl.training.options import FitOptions
 
 CONTACTS = 16
-"""Contact points that are drawn on the part of each cloud ..."""
+"""Contact points that are drawn on the part of each cloud."""
 
 DIRECTIONS = 8
-"""... and directions at each of them."""
+"""Directions that are drawn at each contact point."""
 
 
 def direction_objective(model: nn.Module, options: FitOptions) -> Objective:
     """Mean squared error of the scores of random directions at random points of the part, on clouds that are augmented
     as the options say.
 
-    The label is the true flow's projection on the direction: what a short pull along it gives where the joint alone
-    guides the part. (UMPNet regresses the distance that the simulated part really moved.)
+    The label is the true flow's projection on the direction: what a short pull along it gives if the joint guides
+    the part without friction. (UMPNet regresses the distance that the simulated part really moved.)
     """
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
@@ -50,17 +50,17 @@ def direction_objective(model: nn.Module, options: FitOptions) -> Objective:
 
 
 def direction_cosine(net: CloudNetwork, samples: TensorDictBase, device: torch.device) -> dict[str, Tensor]:
-    """The cosine of the direction found at the point of largest true flow and that flow, of samples [S]."""
+    """Cosine between predicted direction and true flow at the point of largest true flow, of samples [S]."""
     assert isinstance(net, DirectionNet)
     cosines = []
     for batch in samples.split(32):
         points, valid, part = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
         flow = batch["privileged", "flow"].to(device)
         contact = flow.norm(dim=-1).argmax(-1)
-        found = directions_at(net, points, valid, part, contact, SearchOptions())
+        predicted = directions_at(net, points, valid, part, contact, SearchOptions())
         true = gather(flow, contact)
-        # Where nothing moves there is no direction.
-        cosines.append(torch.where(true.any(-1), (found * normalize(true)).sum(-1), torch.nan).cpu())
+        # Where nothing can move there is no true direction.
+        cosines.append(torch.where(true.any(-1), (predicted * normalize(true)).sum(-1), torch.nan).cpu())
     return {"cosine": torch.cat(cosines)}
 
 

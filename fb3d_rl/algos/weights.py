@@ -1,4 +1,4 @@
-"""The weights that a run keeps: its checkpoint, those that did best in validation, and how they are loaded."""
+"""The weights that a run keeps: its checkpoint and the best ones of validation; and how they are loaded."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 CHECKPOINT = "checkpoint.pt"
 
 BEST = "best.safetensors"
-"""The weights of the run that did best in validation."""
+"""The run's weights with the best validation cosine."""
 
 
 def state_before(cfg: TrainConfig, out: Path) -> dict[str, Any] | None:
-    """The checkpoint to go on from. A run that ended before its first one has lost nothing: it begins anew."""
+    """The checkpoint to resume from; None if the run does not resume, or ended before its first checkpoint."""
     path = out / CHECKPOINT
     return load_checkpoint(path, algo=cfg.algo.name) if cfg.resume and path.exists() else None
 

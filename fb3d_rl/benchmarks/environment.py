@@ -1,4 +1,4 @@
-"""How fast the environment is, as ratios measured in one run on the same work: machines differ, ratios less so."""
+"""Speed of the environment, as ratios measured in one run on the same work: they vary less between machines."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def _stock_env(objects: Sequence[ArticulatedObject], options: EnvOptions) -> tup
 
 
 class Replay(TensorDictModuleBase):
-    """Takes recorded actions again: a learner that costs nothing and goes where the recording went.
+    """Repeats recorded actions: a learner without cost that follows the recording.
 
     Args:
         actions: those of the trial with seed i [T, 8], for every i.
@@ -262,7 +262,7 @@ def _trials_per_second(
 
 
 def reading(folders: Sequence[Path], progress: Progress) -> dict[str, Any]:
-    """Seconds to read objects' folders, without a cache and with one, and for a first look at each of them.
+    """Seconds to read objects' folders, without a cache and with one, and for the first cloud of each of them.
 
     The trees that rays are cast in are built then: Embree offers no way to keep them on disk.
     """
@@ -317,7 +317,7 @@ def loading(objects: Sequence[ArticulatedObject], options: EnvOptions, progress:
 def soak(
     objects: Sequence[ArticulatedObject], options: EnvOptions, steps: int, seed: int, progress: Progress
 ) -> dict[str, Any]:
-    """Random actions over many objects, each visited twice: crashes, numbers that are none, growth of memory.
+    """Random actions over many objects, each visited twice: crashes, NaNs, growth of memory.
 
     Memory is compared between the ends of the two visits: in the first one every object is prepared and kept.
     """

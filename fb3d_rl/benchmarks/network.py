@@ -1,7 +1,7 @@
 """How fast ArtFlowNet trains, beside PointNet++ on PyTorch Geometric and torch-cluster as FlowBot3D's release has it.
 
-Each contender is a process of its own, so that its memory can be told; they take turns, and a round's ratio is of times
-that lie side by side. A step is one of training with all that it takes: sampling, neighbours, forward, backward, Adam.
+Each contender is a process of its own, so that its memory can be measured. They take turns, and the ratio of
+a round is of successive times. A step is a whole training step: sampling, neighbours, forward, backward, Adam.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def network_speed(
         rounds: how often each contender has its turn with each batch size.
         peer: folder that :func:`install_peer` filled; None leaves the peer out.
         device: "cpu" or "cuda", of ours.
-        progress: is told what is being done.
+        progress: called with a description of the current work.
     """
     own = [f"{backbone} {precision}" for backbone in BACKBONES for precision in PRECISIONS]
     # The peer as it comes, and with the two settings of the process that our training makes.
@@ -161,7 +161,7 @@ class _Contenders:
         print(batch, steps, file=process.stdin, flush=True)
         line = process.stdout.readline()
         if not line:
-            raise UserError(f"the process that measures {name!r} ended; its message stands above")
+            raise UserError(f"the process that measures {name!r} ended; see its message above")
         answer: dict[str, Any] = json.loads(line)
         return answer
 

@@ -1,6 +1,6 @@
 """PointNet++ on PyTorch Geometric and torch-cluster with FlowBot3D's sizes: what ArtFlowNet's speed is compared with.
 
-For :mod:`fb3d_rl.benchmarks.network` alone, which installs the two packages.
+For :mod:`fb3d_rl.benchmarks.network` only, which installs the two packages.
 """
 
 from __future__ import annotations

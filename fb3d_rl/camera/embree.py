@@ -19,7 +19,7 @@ except ImportError as error:  # no wheel for this platform
 
 @functools.cache
 def _device() -> EmbreeDevice:
-    """Each device takes one of the 1024 thread-local keys that a process has, and a scene makes its own unless told."""
+    """One device for all scenes: each takes one of the process's 1024 thread-local keys."""
     return EmbreeDevice()
 
 

@@ -28,8 +28,8 @@ class CameraOptions:
     margin: float = option(1.15, "the closed object's bounding sphere fills 1 / margin of the field of view")
     kind: str = option(
         "raycast",
-        "what the simulated task sees with: ray casting on the CPU, or SAPIEN's renderer, which needs Vulkan. They see "
-        "the same; flow samples for training always are ray-cast",
+        "the camera of the simulated task: ray casting on the CPU, or SAPIEN's renderer, which needs Vulkan. Both give "
+        "the same clouds; flow samples for training are always ray-cast",
         among=SENSORS,
     )
     shader: Literal["minimal", "default"] = option(
@@ -51,4 +51,4 @@ class CameraOptions:
 
 @dataclass(frozen=True)
 class DepthCameraOptions(ViewRange, CameraOptions):
-    """The depth camera, and where it may stand."""
+    """The depth camera and its viewpoints."""

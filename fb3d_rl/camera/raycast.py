@@ -2,8 +2,8 @@
 
 Every body keeps one static bounding-volume hierarchy in its own frame; for each frame the rays are moved into that
 frame, and only those through pixels that its bounding box may cover are cast. A body's hits are kept until its pose or
-the view changes, to the bit, so that a frame of an episode casts only what moves: a picture follows from poses and view
-alone, whatever was taken before.
+the view changes, so that a frame of an episode casts only what moves. A picture depends on poses and view only, not on
+earlier pictures.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ are merged. From this key on there is no hit."""
 
 
 class RaycastCamera:
-    """Depth camera that looks at one object, and at further bodies (a gripper) that may stand in the way.
+    """Depth camera before one object, and further bodies (a gripper) that may occlude it.
 
     Args:
         obj: the object; its links are numbered as in ``obj.links``.
@@ -56,7 +56,7 @@ class RaycastCamera:
                 self._corners[index] = np.array(list(itertools.product(*extents))).T
         bounds = standing_bounds(obj)
         self.centre: NDArray[np.float64] = bounds.mean(0)
-        """Point that the camera looks at: the centre of the closed, standing object's bounding box, m."""
+        """The point in the middle of the image: the centre of the closed, standing object's bounding box, m."""
         self.radius = 0.5 * float(np.linalg.norm(bounds[1] - bounds[0]))
         """Radius (m) of the sphere around that box."""
         self.distance = self.options.margin * self.radius / math.sin(math.radians(0.5 * self.options.fov))

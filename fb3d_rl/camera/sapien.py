@@ -1,4 +1,4 @@
-"""The depth camera on SAPIEN's renderer (Vulkan: a GPU, or Mesa's lavapipe on a CPU); it sees what RaycastCamera sees.
+"""The depth camera on SAPIEN's renderer (Vulkan: a GPU, or Mesa's lavapipe on a CPU), with RaycastCamera's clouds.
 
 For a ManiSkill task: :func:`add_visuals` makes its bodies visible, :func:`camera_config` describes the sensor, and
 :class:`SapienCamera` reads clouds and pictures from the sensor that ManiSkill makes of it. What is drawn are the meshes
@@ -46,11 +46,11 @@ def require_renderer(
     otherwise: str = "use camera.kind=raycast",
     devices: Sequence[tuple[str, str]] = (("gpu", "cuda"), ("cpu", "cpu")),
 ) -> str:
-    """Start the renderer, so that a machine without one says so before any work, and keep it.
+    """Start the renderer and keep it, so that a machine without one fails before any work.
 
     Args:
-        need: what needs it.
-        otherwise: what can be done without it.
+        need: what needs the renderer, for the message.
+        otherwise: what to do without it, for the message.
         devices: ManiSkill's ``render_backend`` and SAPIEN's device of those that will do, the best first.
 
     Returns:
@@ -60,7 +60,7 @@ def require_renderer(
         UserError: Vulkan finds nothing to render on.
     """
     reasons = []
-    sapien.render.set_log_level("critical")  # the exceptions say it
+    sapien.render.set_log_level("critical")  # the exceptions hold the message
     for backend, device in devices:
         try:
             _renderer(device)
@@ -89,7 +89,7 @@ def add_visuals(entity: sapien.Entity, meshes: Sequence[Mesh], index: int) -> No
     if not meshes:
         return
     corners = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])  # [F, 3, 3]
-    # SAPIEN draws front faces only, and the faces of real objects look either way: draw both sides.
+    # SAPIEN draws front faces only, and the faces of real objects point either way: draw both sides.
     corners = np.concatenate([corners, corners[:, ::-1]])
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-30)
@@ -151,7 +151,7 @@ class SapienCamera:
         self._pictures: dict[str, Tensor] = {}
 
     def capture(self) -> None:
-        """Take a picture of every scene as it is now, which the other methods read."""
+        """Take a picture of the present state of every scene; the other methods read it."""
         self._sensor.camera.scene.update_render(update_human_render_cameras=False)
         self._sensor.capture()
         self._pictures = {}

@@ -1,4 +1,4 @@
-"""Viewpoints around an object: azimuth and elevation (supplement, II.C); and what the pixels of a picture look at."""
+"""Viewpoints around an object: azimuth and elevation (supplement, II.C); rays and points of a picture's pixels."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from fb3d_rl.options import option
 
 @dataclass(frozen=True)
 class View:
-    """Where the camera stands: angles in degrees; azimuth 0 looks at the object's front (which faces -x).
+    """The camera's viewpoint: angles in degrees; azimuth 0 faces the object's front (which faces -x).
 
-    Positive azimuth walks counter-clockwise seen from above; elevation is above the horizon.
+    Positive azimuth is counter-clockwise seen from above; elevation is above the horizon.
     """
 
     azimuth: float
@@ -25,7 +25,7 @@ class View:
 class ViewRange:
     """Ranges (degrees) that viewpoints are drawn from; equal ends fix the angle."""
 
-    azimuth: tuple[float, float] = option((-45.0, 45.0), "lowest and highest; 0 looks at the object's front", "degrees")
+    azimuth: tuple[float, float] = option((-45.0, 45.0), "lowest and highest; 0 faces the object's front", "degrees")
     elevation: tuple[float, float] = option((15.0, 60.0), "lowest and highest, above the horizon", "degrees")
 
     def sample(self, rng: np.random.Generator) -> View:

@@ -1,7 +1,7 @@
 """Control steps on disk with the episodes they belong to: DAgger's replay buffer and demonstrations alike.
 
 A buffer is a folder: TorchRL's memory map of the rows, and ``storage_metadata.json``, TorchRL's own file with the
-number of rows, which here tells about the episodes too. That file is replaced in one step and after the rows are on
+number of rows, to which the table of episodes is added. That file is replaced in one step and after the rows are on
 the disk, so the folder always holds the state of the last commit; ``LazyMemmapStorage(capacity, scratch_dir=folder)``
 of TorchRL can load it as well.
 """
@@ -38,20 +38,20 @@ TABLE = "storage_metadata.json"
 
 @dataclass(frozen=True)
 class EpisodeInfo:
-    """What is known about an episode besides its rows; together with the object it can be run again.
+    """Facts about an episode; with the object they are enough to run it again.
 
     Attributes:
         object: the object's id.
         category: the object's category.
         link: index of the link to open.
         start: joint state [J] (rad or m) at the start; empty if it is not known, as of data from elsewhere.
-        view: where the camera stood.
-        seed: of the random draws within the episode.
-        round: of DAgger, 0 for demonstrations.
+        view: the camera's viewpoint.
+        seed: seed of the random draws within the episode.
+        round: DAgger's round, 0 for demonstrations.
         success: the part was open at the end.
         normalized_distance: |q_goal - q| / |q_goal - q_start| at the end; NaN if it is not known.
-        steps: control steps that the episode took.
-        rows: how many of these, from the first one on, are kept; the buffer says so itself.
+        steps: number of control steps of the episode.
+        rows: number of them that are kept, from the first one on; set by the buffer.
     """
 
     object: str
@@ -75,16 +75,16 @@ class EpisodeInfo:
 class DemonstrationBuffer:
     """Rows of control steps, one after the other, and a table of the episodes that they belong to.
 
-    A row holds whatever keys the first episode came with, and ("episode") [1] int64, its entry in :attr:`episodes`.
+    A row holds the keys of the first episode that was added, and ("episode") [1] int64, its entry in :attr:`episodes`.
     The files have room for ``capacity`` rows from the start, but occupy the disk only as they are filled.
 
-    What was added since the last :meth:`commit` can be read here, and is gone if the process ends.
+    Rows added since the last :meth:`commit` can be read here, but are lost if the process ends.
 
     Attributes:
         path: the folder.
         capacity: most rows that it can hold.
-        about: where the data come from: any facts that JSON can hold.
-        replay: TorchRL's buffer over the rows, to sample from; rows are added by :meth:`extend` alone.
+        about: facts about the data's origin, any that JSON can hold.
+        replay: TorchRL's buffer over the rows, to sample from; add rows with :meth:`extend` only.
     """
 
     def __init__(self, path: Path, capacity: int, about: Mapping[str, Any], episodes: Sequence[EpisodeInfo]) -> None:
@@ -187,8 +187,8 @@ class DemonstrationBuffer:
         self._ends.append(size + count)
 
     def commit(self) -> None:
-        """Make what was added outlast this process, and a failure of the machine's power."""
-        # Without rows there may be files of rows that are no more.
+        """Write all that was added to the disk, so that it survives a crash or a power failure."""
+        # Without rows there may be files of rows that were dropped.
         below = self.path.rglob("*") if len(self) else ()
         files = [file for file in below if file.is_file() and not file.name.startswith((TABLE, "."))]
         for file in files:
@@ -209,7 +209,7 @@ class DemonstrationBuffer:
         _sync(self.path)
 
     def truncate(self, rows: int) -> None:
-        """Drop all rows from ``rows`` on, and commit: to go back to where a checkpoint was.
+        """Drop all rows from ``rows`` on and commit: back to the state of a checkpoint.
 
         An episode that extends beyond keeps its beginning.
 
@@ -224,20 +224,22 @@ class DemonstrationBuffer:
                 kept.append(replace(info, rows=min(info.rows, rows)))
                 rows -= kept[-1].rows
         self._episodes, self._ends = kept, _ends(kept)
-        self.commit()  # now: the rows of the old commit may be written over from here on
+        self.commit()  # before new rows overwrite those of the old commit
         self._load()
 
     def filter(
         self, path: Path | str, keep: Callable[[EpisodeInfo], bool], about: Mapping[str, Any] | None = None
     ) -> DemonstrationBuffer:
-        """Copy the episodes that ``keep`` says yes to into a new buffer at ``path``, and commit it.
+        """Copy the episodes for which ``keep`` is true into a new buffer at ``path``, and commit it.
 
         Raises:
             UserError: there is something at ``path``, or no episode is kept.
         """
         chosen = [episode for episode, info in enumerate(self._episodes) if keep(info)]
         if not chosen:
-            raise UserError(f"none of the {len(self._episodes)} episodes of {self.path} is kept; ask for less")
+            raise UserError(
+                f"none of the {len(self._episodes)} episodes of {self.path} is kept; give weaker conditions"
+            )
         rows = sum(self._episodes[episode].rows for episode in chosen)
         with new_buffer(path, rows, {**self.about, **(about or {})}) as copy:
             for episode in chosen:
@@ -252,7 +254,7 @@ class DemonstrationBuffer:
             writer.load_state_dict({"_cursor": len(self) % self.capacity})
 
     def _clear(self) -> None:
-        """Remove what an attempt left behind that was never committed."""
+        """Remove files that were never committed."""
         for entry in self.path.iterdir():
             if entry.is_dir():
                 shutil.rmtree(entry)
@@ -277,13 +279,13 @@ def new_buffer(path: Path | str, capacity: int, about: Mapping[str, Any]) -> Ite
 
 
 def demonstrated(frames: TensorDictBase) -> TensorDictBase:
-    """Frames [T] of data from elsewhere with the keys that they lack: who acted was the expert, in every step.
+    """Frames [T] of foreign data with the keys that they lack; the expert counts as acting in every step.
 
     Raises:
         UserError: the observation or the action is not what the data contract says.
     """
     if ("observation", "goal_sense") not in frames.keys(include_nested=True):
-        frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # who says nothing of a goal opens
+        frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # without a goal the task is to open
     try:
         contract.check(frames, "observation")
         contract.check(frames, "action")
@@ -301,8 +303,8 @@ def demonstrated(frames: TensorDictBase) -> TensorDictBase:
     return frames
 
 
-def stranger(category: str, success: bool, steps: int, seed: int = 0) -> EpisodeInfo:
-    """What there is to say about an episode from elsewhere, of which neither object nor start are known."""
+def foreign_episode(category: str, success: bool, steps: int, seed: int = 0) -> EpisodeInfo:
+    """The facts of an episode of foreign data, whose object and start are unknown."""
     return EpisodeInfo("unknown", category, -1, (), View(0.0, 0.0), seed, 0, success, math.nan, steps)
 
 
@@ -317,7 +319,7 @@ def _ends(episodes: Sequence[EpisodeInfo]) -> list[int]:
 
 
 def _sync(path: Path) -> None:
-    """Have the disk hold what the file or the folder's list of files holds."""
+    """Flush a file, or a folder's list of files, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # takes seconds, which every worker process would wait
 DONE = "samples.json"
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
-"""What reading a data set of which a file is missing or cut raises."""
+"""The exceptions of reading a data set with missing or damaged files."""
 
 
 def generate_samples(
@@ -44,15 +44,15 @@ def generate_samples(
 ) -> TensorDictBase:
     """Fill a memory map with ``count`` samples of the objects in ``folders``.
 
-    Given the objects and the count, sample i depends on (seed, i) alone, whatever the number of workers. Objects take
-    turns, so that each is seen equally often up to one. A finished data set in ``out`` that was made from the same
-    arguments, and objects of the same content wherever they lie, is reused.
+    Given the objects and the count, sample i depends on (seed, i) only, not on the number of workers. The counts of the
+    objects' samples differ by one at most. A finished data set in ``out`` that was made from the same
+    arguments, and from objects of the same content in any folder, is reused.
 
     Args:
-        out: folder of the memory map; what an interrupted call left there is drawn anew.
+        out: folder of the memory map; an unfinished one is drawn anew.
         folders: PartNet-Mobility object folders.
         count: number of samples S.
-        seed: base seed.
+        seed: seed of all draws.
         options: how samples are drawn.
         workers: number of worker processes; 0 draws in this process.
         progress: called with the number of samples drawn so far.
@@ -100,15 +100,15 @@ def generate_samples(
 
 
 def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:
-    """The rows of the finished data set in a folder; None if there is none, or one that is damaged.
+    """The rows of the finished data set in a folder; None if there is none or it is damaged.
 
     Raises:
-        UserError: they were made by another recipe, so that they are not this caller's to replace.
+        UserError: they were made from another recipe.
     """
     try:
         kept, wanted = recipe_of(out), json.loads(json.dumps(recipe))
     except DAMAGED:
-        return None  # not there, or not whole: it is drawn anew
+        return None  # missing or damaged: it is drawn anew
     if kept != wanted:
         differing = sorted(key for key in {*kept, *wanted} if kept.get(key) != wanted.get(key))
         raise UserError(
@@ -122,13 +122,13 @@ def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None
 
 
 def recipe_of(out: Path) -> dict[str, Any]:
-    """How the finished data set in a folder was made."""
+    """The recipe of the finished data set in a folder."""
     recipe: dict[str, Any] = json.loads((out / DONE).read_text())["recipe"]
     return recipe
 
 
 def finish(out: Path, recipe: Mapping[str, Any], **facts: int) -> None:
-    """Write down that the data set in a folder is whole, and how it was made."""
+    """Mark the data set in a folder as finished, with its recipe."""
     write_text(out / DONE, json.dumps({"recipe": recipe, **facts}))
 
 
@@ -171,10 +171,10 @@ def load_samples(folder: Path) -> TensorDictBase:
 
 
 def _rows(folder: Path) -> TensorDictBase:
-    """The rows of a data set, once all of its files are seen to be whole.
+    """The rows of a data set, after a check that its files are complete.
 
     Raises:
-        ValueError, and what else is in DAMAGED: they are not.
+        ValueError or another of DAMAGED: a file is missing or incomplete.
     """
     for about in (folder / "rows").rglob("meta.json"):
         for name, entry in json.loads(about.read_text()).items():
@@ -192,7 +192,7 @@ def _quiet() -> None:
 
 
 def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:
-    """A memory map of ``count`` rows of zeros in an emptied folder, and what else is in there gone."""
+    """A memory map of ``count`` rows of zeros in a folder, which is emptied first."""
     row = TensorDict(
         {
             "observation": {
@@ -234,7 +234,7 @@ def _draw_object(
 
 
 def _refill(rows: TensorDictBase, missing: list[int], count: int) -> None:
-    """Give rows whose object showed nothing a copy of other rows, evenly spread, so that all rows are samples."""
+    """Fill the rows that could not be drawn with copies of evenly spread other rows."""
     if not missing:
         return
     present = np.setdiff1d(np.arange(count), missing)

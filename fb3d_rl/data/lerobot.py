@@ -3,16 +3,16 @@
 LeRobot rather than Minari, because most robot-learning policies that can be downloaded train from it, and v3.0 rather
 than v2.1, because LeRobot reads nothing older since 0.4. The layout is that of huggingface.co/docs/lerobot,
 "LeRobotDataset v3.0": ``data/*/*.parquet`` holds the rows, ``meta/info.json`` the features,
-``meta/episodes/*/*.parquet`` where each episode is, ``meta/tasks.parquet`` its sentence and ``meta/stats.json`` the
-features' minimum, maximum, mean and standard deviation.
+``meta/episodes/*/*.parquet`` the place of each episode, ``meta/tasks.parquet`` the sentences of the tasks, and
+``meta/stats.json`` the features' minimum, maximum, mean and standard deviation.
 
 A key becomes a feature of its own shape, joined by dots: clouds are "observation.points", float32 [N, 3]. The table of
-episodes is in ``meta/fb3d_rl.json``, which LeRobot leaves alone. So what is read back equals what was written in every
-bit. Not carried: the buffer's capacity, and keys with a dot in their name. Statistics of single episodes, which LeRobot
+episodes is in ``meta/fb3d_rl.json``, which LeRobot does not read. So what is read back equals what was written in every
+bit. Not kept: the buffer's capacity, and keys with a dot in their name. Statistics of single episodes, which LeRobot
 needs to merge data sets only, are left out.
 
-Data sets from elsewhere can be read if their features have the names and shapes of the data contract. Their episodes
-count as successful: LeRobot has no word for it, and a demonstration that failed is not published.
+Data sets of other projects can be read if their features have the names and shapes of the data contract. Their episodes
+count as successful: LeRobot's format has no field for it, and failed demonstrations are rarely published.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, new_buffer, stranger
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, foreign_episode, new_buffer
 from fb3d_rl.errors import UserError
 
 VERSION = "v3.0"
@@ -39,7 +39,7 @@ ABOUT = "meta/fb3d_rl.json"
 DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 FILE_MB, CHUNK_FILES = 100, 1000
-"""LeRobot's own: megabytes of a file, files of a folder."""
+"""LeRobot's defaults: megabytes of a file, files of a folder."""
 COLUMNS = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -47,7 +47,7 @@ COLUMNS = {
     "index": "int64",
     "task_index": "int64",
 }
-"""What every data set of LeRobot has."""
+"""The columns that every data set of LeRobot has."""
 
 
 def write(buffer: DemonstrationBuffer, folder: Path, rate: int) -> None:
@@ -55,7 +55,7 @@ def write(buffer: DemonstrationBuffer, folder: Path, rate: int) -> None:
 
     Args:
         buffer: the demonstrations.
-        folder: appears in whole or not at all.
+        folder: the new folder; after an error it does not exist.
         rate: control steps per second.
 
     Raises:
@@ -110,8 +110,10 @@ def read(folder: Path, out: Path | str) -> DemonstrationBuffer:
         with new_buffer(out, max(info["total_frames"], 1), about) as buffer:
             for k, frames in enumerate(_read_rows(folder, info["features"])):
                 frames = demonstrated(frames)
-                known = EpisodeInfo.from_dict(own["episodes"][k]) if own else stranger("unknown", True, len(frames))
-                buffer.extend(frames, known)
+                facts = (
+                    EpisodeInfo.from_dict(own["episodes"][k]) if own else foreign_episode("unknown", True, len(frames))
+                )
+                buffer.extend(frames, facts)
     except (OSError, ValueError, KeyError, TypeError, IndexError, arrow.ArrowException) as error:
         raise UserError(f"{folder} cannot be read as a data set of LeRobot ({error})") from error
     return buffer
@@ -126,7 +128,7 @@ class _Stats:
         self.mean, self.deviation = np.zeros(shape), np.zeros(shape)
 
     def add(self, values: NDArray[Any]) -> None:
-        """Take in ``values`` [T, *shape]: means and squared deviations combine (Chan et al. 1979)."""
+        """Add ``values`` [T, *shape]; means and squared deviations are combined as in Chan et al. 1979."""
         values, count = values.astype(np.float64), len(values)
         self.least, self.most = np.minimum(self.least, values.min(0)), np.maximum(self.most, values.max(0))
         shift, total = values.mean(0) - self.mean, self.count + count
@@ -135,10 +137,10 @@ class _Stats:
         self.count = total
 
     def result(self) -> dict[str, list[Any]]:
-        """As LeRobot keeps them."""
+        """The statistics in LeRobot's layout."""
         std = np.sqrt(self.deviation / self.count)
-        found = {"min": self.least, "max": self.most, "mean": self.mean, "std": std}
-        return {name: value.tolist() for name, value in found.items()} | {"count": [self.count]}
+        arrays = {"min": self.least, "max": self.most, "mean": self.mean, "std": std}
+        return {name: value.tolist() for name, value in arrays.items()} | {"count": [self.count]}
 
 
 def _write_rows(
@@ -177,9 +179,9 @@ def _columns(buffer: DemonstrationBuffer, k: int, rate: int, task: int) -> dict[
     """The columns [T, ...] of episode ``k``."""
     frames, first = buffer.frames(k), buffer.first_row(k)
     steps = np.arange(len(frames))
-    found = {".".join(_names(key)): frames.get(key).numpy() for key in buffer.keys if key != "episode"}
+    columns = {".".join(_names(key)): frames.get(key).numpy() for key in buffer.keys if key != "episode"}
     own = (steps / rate, steps, np.full_like(steps, k), first + steps, np.full_like(steps, task))
-    return found | {name: values.astype(COLUMNS[name]) for name, values in zip(COLUMNS, own, strict=True)}
+    return columns | {name: values.astype(COLUMNS[name]) for name, values in zip(COLUMNS, own, strict=True)}
 
 
 def _column(values: NDArray[Any]) -> Any:
@@ -242,7 +244,7 @@ def _episode_table(buffer: DemonstrationBuffer, places: Sequence[tuple[int, int]
 
 
 def _task_table(tasks: Sequence[str]) -> Any:
-    """The table that LeRobot reads as a pandas one whose index are the sentences."""
+    """The table of tasks, with pandas' metadata: LeRobot reads the sentences as its index."""
     arrow, _ = _arrow()
     index = "__index_level_0__"
     about = {

@@ -2,12 +2,12 @@
 
 ``traj_<k>`` holds ``actions`` [T, 8], ``terminated``, ``truncated``, ``success`` [T] and below ``obs`` the groups that
 the task's observation has ("observation", "privileged") with T + 1 moments. A buffer has no observation of the moment
-after the last step: there the last one is repeated, which ManiSkill's loaders leave out, and ours does. All further
+after the last step: the last one is repeated there, which ManiSkill's loaders and ours leave out. All further
 keys (the expert's label, who acted) are below ``fb3d_rl``, the table of the episodes is in the JSON file, so what is
-read back equals what was written in every bit. Not carried: the buffer's capacity; there are no ``env_states``.
+read back equals what was written in every bit. Not kept: the buffer's capacity; there are no ``env_states``.
 
-Read are also files that RecordEpisode wrote of this package's task with ``obs_mode="pointcloud"``. Their actions become
-the expert's labels; which object and trial an episode was is not in them, so it cannot be run again.
+Files that RecordEpisode wrote of this package's task with ``obs_mode="pointcloud"`` can be read, too. Their actions
+become the expert's labels; they do not name object and trial, so that their episodes cannot be run again.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, new_buffer, stranger
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, demonstrated, foreign_episode, new_buffer
 from fb3d_rl.errors import UserError
 from fb3d_rl.files import replacing, write_text
 
 OWN = "fb3d_rl"
-"""Group of a trajectory, and key in the JSON file, for what ManiSkill has no place for."""
+"""Group of a trajectory, and key in the JSON file, for facts that ManiSkill's format has no place for."""
 
 
 def write(buffer: DemonstrationBuffer, path: Path) -> None:
     """Write all episodes to ``path`` (.h5) and the JSON file beside it.
 
     Args:
-        buffer: the demonstrations; ``about["env_info"]`` and ``about["control_mode"]`` go where ManiSkill has them.
+        buffer: the demonstrations; ManiSkill's fields get ``about["env_info"]`` and ``about["control_mode"]``.
         path: ends in ``.h5``.
 
     Raises:
@@ -109,21 +109,21 @@ def _write_episode(group: Any, frames: TensorDictBase, info: EpisodeInfo) -> Non
 def _read_episode(group: Any, entry: Mapping[str, Any]) -> tuple[TensorDictBase, EpisodeInfo]:
     steps = len(group["actions"])
     frames: TensorDictBase = TensorDict({"action": torch.from_numpy(group["actions"][:])}, batch_size=[steps])
-    _take(frames, group["obs"], ())
+    _read_group(frames, group["obs"], ())
     if OWN in group:
-        _take(frames, group[OWN], ())
+        _read_group(frames, group[OWN], ())
     if OWN in entry:
         return demonstrated(frames), EpisodeInfo.from_dict(entry[OWN])
     success = "success" in group and bool(group["success"][-1])
-    return demonstrated(frames), stranger("unknown", success, steps)
+    return demonstrated(frames), foreign_episode("unknown", success, steps)
 
 
-def _take(frames: TensorDictBase, group: Any, names: tuple[str, ...]) -> None:
+def _read_group(frames: TensorDictBase, group: Any, names: tuple[str, ...]) -> None:
     if not hasattr(group, "items"):
         raise ValueError('its observations are flat; record them with obs_mode="pointcloud"')
     for name, item in group.items():
         if hasattr(item, "items"):
-            _take(frames, item, (*names, name))
+            _read_group(frames, item, (*names, name))
         else:
             value = torch.from_numpy(item[: len(frames)])
             frames[(*names, name)] = value if value.ndim > 1 else value[:, None]

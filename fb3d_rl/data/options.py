@@ -1,4 +1,4 @@
-"""Options of flow samples and of the data sets that are made of them."""
+"""Options of flow samples and of data sets of them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from fb3d_rl.options import option
 
 @dataclass(frozen=True)
 class SampleOptions:
-    """How flow samples are drawn: from where (``views``) and with which optics (``camera``), and what moves in them."""
+    """How flow samples are drawn; ``views`` are the viewpoints and ``camera`` is the optics."""
 
-    points: int = option(1200, "N, points of a cloud", within="[64, inf)")
+    points: int = option(1200, "number N of points of a cloud", within="[64, inf)")
     views: ViewRange = ViewRange()
     camera: CameraOptions = CameraOptions()
     closed_share: float = option(
@@ -55,16 +55,18 @@ class SampleOptions:
 
 @dataclass(frozen=True)
 class DataOptions(SampleOptions):
-    """Flow samples, the data sets that are made of them, and the expert's labels."""
+    """Flow samples, data sets of them, and the expert's labels."""
 
     train_samples: int = option(4000, "samples to train flow networks on")
-    dataset: str | None = option(None, "the folder samples/ of another run, to train on what it drew; null draws anew")
+    dataset: str | None = option(
+        None, "the folder samples/ of another run, to train on its samples; null: draw new ones"
+    )
     met_by: str | None = option(
         None,
-        "an ArtFlowNet (checkpoint.pt, .safetensors) whose policy runs trials with the training objects; what it sees "
-        "there is trained on, too",
+        "an ArtFlowNet (checkpoint.pt, .safetensors): clouds from rollouts of its policy with the training objects are "
+        "training samples, too",
     )
-    met_samples: int = option(2000, "how many such clouds")
-    labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds")
+    met_samples: int = option(2000, "number of clouds from these rollouts")
+    labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds together")
     eval_samples: int = option(8, "samples of each held-out object on which the flow is measured", within="[1, inf)")
     workers: int | None = option(None, "worker processes that draw samples; null: one per core", within="[0, inf)")

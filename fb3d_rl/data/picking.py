@@ -1,4 +1,4 @@
-"""Rows by number, as a list or a tensor gives them, so that loops and torch's DataLoader work on what lies on disk."""
+"""Indexing of rows on disk as of a list or a tensor, so that loops and torch's DataLoader work with them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def pick(index: Index, size: int, take: Callable[[Tensor], TensorDictBase]) -> T
 
     Args:
         index: see :data:`Index`.
-        size: how many rows there are.
+        size: number of rows.
         take: gives the rows [K] of numbers [K] int64 that lie in [0, size).
 
     Raises:
@@ -41,7 +41,7 @@ def pick(index: Index, size: int, take: Callable[[Tensor], TensorDictBase]) -> T
 
 
 def _collate(batch: Any, *, collate_fn_map: object = None) -> TensorDictBase:
-    """A batch of a DataLoader that has no function of its own for it; torch would take the rows for dictionaries."""
+    """The default batches of torch's DataLoader for rows, which it would else treat as dictionaries."""
     rows: TensorDictBase = batch if isinstance(batch, TensorDictBase) else torch.stack(batch)
     return rows
 

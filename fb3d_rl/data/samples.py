@@ -30,7 +30,7 @@ def flow_sample(cloud: Cloud, *targets: int, masked: bool = True) -> TensorDict:
 
 
 def draw_sample(posed: Posed, options: SampleOptions, rng: np.random.Generator) -> TensorDict | None:
-    """Draw one sample of an object, or None if no openable part shows itself within :data:`TRIES` views."""
+    """Draw one sample of an object; None if no openable part is visible in :data:`TRIES` views."""
     movable, closed, opened = posed.obj.movable, posed.closed, posed.opened
     for _ in range(TRIES):
         link = int(rng.choice(posed.openable))

@@ -1,1 +1,1 @@
-"""Pictures: a renderer for the CPU, arrows, captions, and the encoding of videos. It knows no policy and no trial."""
+"""Pictures: a renderer for the CPU, arrows, and the encoding of videos; independent of policies and trials."""

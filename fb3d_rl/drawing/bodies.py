@@ -1,4 +1,4 @@
-"""What a picture shows: rigid bodies of coloured meshes, and what rays find of them."""
+"""The content of a picture: rigid bodies of coloured meshes, and the surfaces that rays hit."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STATIC, MOVABLE, TARGET, GRIPPER = srgb("#cdd2d9"), srgb("#aebccd"), srgb("#3f7f
 
 
 def link_colors(obj: ArticulatedObject, *links: int) -> list[Color]:
-    """Colors of the object's links: what ``links`` carry, what else can move, what stands."""
+    """Colors of the object's links: those that ``links`` carry, other movable ones, static ones."""
     target = {i for each in links for i in obj.descendants(each)}
     movable = {i for each in obj.movable for i in obj.descendants(each)}
     return [TARGET if i in target else MOVABLE if i in movable else STATIC for i in range(len(obj.links))]
@@ -42,7 +42,7 @@ def link_colors(obj: ArticulatedObject, *links: int) -> list[Color]:
 
 @dataclass
 class Surface:
-    """What S rays meet: distance (m), unit normal towards the eye, linear colour and the body's number.
+    """The surfaces that S rays hit: distance (m), unit normal towards the eye, linear colour and the body's number.
 
     ``behind`` is the colour of a sign that this hides, black where there is none.
     """
@@ -60,7 +60,7 @@ class Surface:
         return Surface(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def put(self, where: NDArray[np.intp], other: Surface, body: int) -> NDArray[np.intp]:
-        """Take over what of ``other`` [len(where)] is nearer; return where that is so."""
+        """Copy the entries of ``other`` [len(where)] that are nearer; return their indices."""
         nearer = other.distance < self.distance[where]
         taken = where[nearer]
         self.distance[taken], self.normal[taken] = other.distance[nearer], other.normal[nearer]
@@ -90,9 +90,9 @@ class Body:
 
     Args:
         parts: the parts.
-        sign: this is a sign such as an arrow: it neither takes light from others nor do they from it, and it shimmers
-            through what hides it.
-        opaque: no sign shimmers through this.
+        sign: whether this is a sign such as an arrow, which casts and gets no shadow and is visible, faintly, through
+            other bodies.
+        opaque: whether it hides signs completely.
     """
 
     def __init__(self, parts: Iterable[Part], sign: bool = False, opaque: bool = False) -> None:
@@ -126,7 +126,7 @@ class Body:
         return self._points[(self._points @ spread(64).T.astype(np.float32)).argmax(0)].astype(np.float64)
 
     def hit(self, pose: NDArray[np.float64], eye: NDArray[np.float64], rays: F32) -> tuple[NDArray[np.intp], Surface]:
-        """Which of the unit ``rays`` [R, 3] from ``eye`` [3] hit the body at T_world_body ``pose``, and what there."""
+        """Which of the unit ``rays`` [R, 3] from ``eye`` [3] hit the body at T_world_body ``pose``, and where."""
         if self._scene is None or not len(rays):
             none = np.zeros((0, 3), dtype=np.float32)
             return np.zeros(0, dtype=np.intp), Surface(none[:, 0], none, none, np.zeros(0, dtype=np.int16), none)

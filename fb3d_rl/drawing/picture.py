@@ -22,7 +22,7 @@ def write_picture(run_dir: Path, columns: int = 4) -> Path:
 
     Args:
         run_dir: a run folder with clouds.npz.
-        columns: how many clouds.
+        columns: number of clouds.
 
     Returns:
         The picture's path.

@@ -25,7 +25,7 @@ def _turned(profile: Sequence[tuple[float, float]], sections: int) -> Mesh:
 
 
 def cup_mesh(gripper: Sequence[Sequence[Mesh]]) -> Mesh:
-    """A suction cup at the fingers' ends, about the hand's x axis: only to be seen, not felt."""
+    """A suction cup at the fingers' ends, about the hand's x axis: drawn only, not simulated."""
     end = max(float(mesh.vertices[:, 0].max()) for meshes in gripper for mesh in meshes)
     made = _turned([(0, -0.06), (0.014, -0.06), (0.016, -0.04), (0.036, 0.002), (0, 0.002)], 24)
     return Mesh(made.vertices[:, [2, 0, 1]] + [end, 0, 0], made.faces)

@@ -1,7 +1,7 @@
 """Shaded pictures on the CPU: Embree rays, a soft key light, a bright sky and a ground that catches shadows.
 
-No Vulkan and no GPU. A :class:`Studio` has one camera and the bodies that stay where they are: what they look like,
-and which light they take from each other, is found once. A picture then only costs the rays at what moves.
+No Vulkan and no GPU. A :class:`Studio` has one camera and the bodies that do not move, whose colours and shadows are
+computed once. A picture then only costs the rays at moving bodies.
 """
 
 from __future__ import annotations
@@ -15,32 +15,32 @@ from fb3d_rl.drawing.bodies import F32, GAMMA, SIGN, Body, Placed, Surface, dot,
 from fb3d_rl.drawing.camera import Camera
 
 TILE = 4
-"""Side (pixels) of the square in which every pixel looks for light in other directions."""
+"""Side (pixels) of the square in which every pixel samples other directions of the light."""
 
 SKY_RAYS = 3
-"""Directions in which a pixel looks for the sky."""
+"""Directions in which a pixel samples the sky."""
 
 KEY, SKY = 0.62, 0.52
-"""Light of the key light on a surface that faces it, and of a sky that nothing hides."""
+"""Light of the key light on a surface that faces it, and of the whole sky."""
 
 KEY_AZIMUTH, KEY_ELEVATION, KEY_WIDTH = 42.0, 48.0, 6.0
-"""Where the key light stands (degrees, to the left of the camera and above the horizon), and half the angle under which
-it is seen, which makes its shadows soft."""
+"""Direction of the key light (degrees, to the left of the camera and above the horizon), and half its angular size,
+which makes its shadows soft."""
 
 SHADOW = 0.75
-"""How dark the ground gets where no light comes; 1 is black."""
+"""Darkness of the ground in full shadow; 1 is black."""
 
 OCCLUSION = 0.35
-"""How far (m) a surface looks for others that keep the sky's light from it."""
+"""Distance (m) within which other surfaces block the sky's light."""
 
 BACKDROP = (0.985, 0.988, 0.992), (0.90, 0.915, 0.93)
 """Colours (sRGB) of the background in the middle and in the corners of the image."""
 
 SUBPIXELS = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]])
-"""Where (x, y) in a pixel the rays go that smooth an edge."""
+"""Points (x, y) in a pixel of the rays that smooth an edge."""
 
 GHOST = 0.3
-"""How much of a sign is seen through what hides it."""
+"""Opacity of a sign behind other bodies."""
 
 FAR = 1e6
 """Distance (m) of the empty background."""
@@ -50,11 +50,11 @@ GROUND, NOTHING = -1, -2
 
 
 class Studio:
-    """One camera before bodies that stay where they are.
+    """One camera before bodies that do not move.
 
     Args:
         camera: the camera.
-        still: what does not move, in the world's frame.
+        still: the static bodies, in the world's frame.
     """
 
     def __init__(self, camera: Camera, still: Body) -> None:
@@ -80,7 +80,7 @@ class Studio:
         self._fine = self._finely(edges)
 
     def _empty(self, rays: F32, backdrop: F32) -> Surface:
-        """The ground and the background behind it, as ``rays`` [S, 3] meet them."""
+        """Where ``rays`` [S, 3] hit the ground, and the background elsewhere."""
         distance, normal = np.full(len(rays), FAR, np.float32), np.zeros((len(rays), 3), np.float32)
         body = np.full(len(rays), NOTHING, dtype=np.int16)
         down = np.flatnonzero((rays[:, 2] < -1e-3) & (self._eye[2] > 0))
@@ -88,7 +88,7 @@ class Studio:
         return Surface(distance, normal, backdrop.copy(), body, np.zeros_like(normal))
 
     def _points_of(self, seen: Surface, where: NDArray[np.intp]) -> F32:
-        """Where the rays ``where`` meet what they see, a little before it."""
+        """The points that the rays ``where`` hit, moved a little off the surface."""
         return self._eye.astype(np.float32) + self._rays[where] * seen.distance[where, None] + 1e-3 * seen.normal[where]
 
     def _light_directions(self) -> tuple[F32, F32, F32]:
@@ -231,7 +231,7 @@ class Studio:
         return np.flatnonzero(edge)
 
     def _finely(self, pixels: NDArray[np.intp]) -> Surface:
-        """What several rays through each of ``pixels`` [E] meet without the moving bodies, [E * 4]."""
+        """The surfaces that several rays through each of ``pixels`` [E] hit without the moving bodies, [E * 4]."""
         rays = self._fine_rays(pixels)
         seen = self._empty(rays, np.repeat(self._backdrop[pixels], len(SUBPIXELS), axis=0))
         body, pose = self._still

@@ -15,7 +15,7 @@ from fb3d_rl.files import replacing
 
 
 def require_encoder() -> None:
-    """Look for ffmpeg, so that a machine without it says so before any work.
+    """Check that ffmpeg is installed, so that a machine without it fails before any work.
 
     Raises:
         UserError: there is no ffmpeg.
@@ -48,18 +48,7 @@ def encode(images: Iterable[NDArray[np.uint8]], path: Path, size: tuple[int, int
         hold: how long (s) the last one stays.
     """
     codec, pixels, options = _ENCODERS[path.suffix]
-    same = [
-        "-threads",
-        "1",
-        "-filter_threads",
-        "1",
-        "-map_metadata",
-        "-1",
-        "-fflags",
-        "+bitexact",
-        "-flags",
-        "+bitexact",
-    ]
+    same = "-threads 1 -filter_threads 1 -map_metadata -1 -fflags +bitexact -flags +bitexact".split()
     with replacing(path) as part:
         writer = imageio_ffmpeg.write_frames(
             part,

@@ -1,4 +1,4 @@
-"""Which modes, simulator and renderer a task can run with; what is not there is said before any work."""
+"""The modes, simulators and renderers that a task can run with; a missing one is an error before any work."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def require_mode(name: str, word: str | None, known: Sequence[str]) -> None:
         UserError: the task knows no such mode.
     """
     if word not in (None, *known):
-        raise UserError(f"{name}={word!r} is none of this task's; choose from {', '.join(known)}")
+        raise UserError(f"{name}={word!r} is unknown to this task; choose from {', '.join(known)}")
 
 
 def choose_renderer(word: str | None, obs_mode: str | None, render_mode: str | None, camera: str) -> str:
@@ -90,6 +90,6 @@ def _device(known: Mapping[str, str], key: str, word: str) -> str:
     if name == "pci":  # ManiSkill hands it to SAPIEN
         return word
     if name not in known or (number and not number.isdigit()):
-        raise UserError(f"{key}={word!r} is none; choose from {', '.join(known)}")
+        raise UserError(f"{key}={word!r} is unknown; choose from {', '.join(known)}")
     kind = "cpu" if known[name].endswith("cpu") else "cuda"
     return f"{kind}:{number}" if number else kind

@@ -39,7 +39,7 @@ class FloatingSuctionGripper(BaseAgent):
         super().__init__(*args, **kwargs)
 
     def _load_articulation(self, initial_pose: Any = None) -> None:
-        """As ManiSkill's own, but the URDF is parsed once, since that takes longer than the rest of a reset."""
+        """As ManiSkill's, but the URDF is parsed once: that takes longer than the rest of a reset."""
         cls = type(self)
         if cls._builder is None:
             loader = self.scene.create_urdf_loader()

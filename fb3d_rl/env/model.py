@@ -1,4 +1,4 @@
-"""An object as the simulator has it: built from what was read of it, with collision shapes that PhysX can simulate."""
+"""An object in the simulator: built from its parsed model, with collision shapes that PhysX can simulate."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ OBJECT_BIT = 30
 """Bit of collision group 2 that the object's links and the ground share, so that they do not collide.
 
 Parts of real objects overlap at rest and hulls overlap even more, so contact among them would jam every joint; and
-an object that stands on the ground would rub on it. The gripper has no such bit: it touches all of them.
+an object on the ground would rub on it. The gripper has no such bit: it touches all of them.
 """
 
 
 PLATE = 0.002
-"""Thickness (m) of what PhysX cannot make a body of; it makes flat panes as thick by itself."""
+"""Thickness (m) of the plate that replaces a flat mesh; PhysX itself makes flat panes as thick."""
 
 
 def add_ground(scene: ManiSkillScene) -> None:
-    """Add the plane z = 0, which the object does not rub on."""
+    """Add the plane z = 0, which does not collide with the object."""
     ground = scene.create_actor_builder()
     ground.add_plane_collision(sapien.Pose(q=[0.7071068, 0, -0.7071068, 0]))
     ground.collision_groups[2] |= 1 << OBJECT_BIT
@@ -50,7 +50,7 @@ def add_ground(scene: ManiSkillScene) -> None:
 
 
 class Model(Posed):
-    """What is computed of an object once, however often it is built into a scene.
+    """An object with all that is computed once, although it is built into many scenes.
 
     Its further bodies are the gripper's: hand, left and right finger, each in its own frame.
 
@@ -67,8 +67,8 @@ class Model(Posed):
     def shapes(self) -> list[list[Any]]:
         """Collision shapes of each link [L], cooked once: making them anew takes longer than the rest of a reset.
 
-        What moves collides as the convex hulls of its collision meshes (more PhysX does not simulate), what does not
-        move as both sides of their surface, placed in the world: a hull would close hollow bodies.
+        Links that move collide as the convex hulls of their collision meshes, since PhysX simulates no others. Static
+        links collide as both sides of the meshes' surface, placed in the world: a hull would close hollow bodies.
         """
         poses = self.poses(np.zeros(len(self.obj.movable)))
         shapes: list[list[Any]] = []
@@ -88,7 +88,7 @@ class Model(Posed):
     def build(self, scene: ManiSkillScene, e: int) -> Articulation:
         """Build the object in environment ``e``.
 
-        It is built from what was read of it: its files are from strangers and are not parsed a second time.
+        It is built from its parsed model: the files are not trusted and are not parsed a second time.
         """
         obj, o = self.obj, self._options
         builder = scene.create_articulation_builder()
@@ -103,7 +103,7 @@ class Model(Posed):
                 continue
             links[-1].set_joint_name(link.joint.name)
             axis = sapien.Pose(_axis_frame(link.joint))
-            # SAPIEN calls a hinge with limits "revolute_unwrapped" and one that turns on and on "revolute".
+            # SAPIEN calls a hinge with limits "revolute_unwrapped" and one without "revolute".
             kinds = {"revolute": "revolute_unwrapped", "continuous": "revolute"}
             links[-1].set_joint_properties(
                 kinds.get(link.joint.type, link.joint.type),
@@ -118,7 +118,7 @@ class Model(Posed):
         return articulation
 
     def add_shapes(self, links: Sequence[PhysxArticulationLinkComponent]) -> PhysxRigidStaticComponent:
-        """Give the links their shapes; the result has those of what does not move.
+        """Give the moving links their shapes; return a body with those of the static links.
 
         Only a static body can have a surface as its shape.
         """
@@ -131,7 +131,7 @@ class Model(Posed):
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """PhysX' complaints about meshes that are mended."""
+    """Without PhysX' warnings about meshes that are repaired here."""
     sapien.set_log_level("off")
     try:
         yield
@@ -150,9 +150,9 @@ def _hull(mesh: Mesh) -> PhysxCollisionShapeConvexMesh:
 
 
 def _surface(mesh: Mesh) -> PhysxCollisionShapeTriangleMesh | PhysxCollisionShapeConvexMesh:
-    """The mesh's surface; a plate where that is too thin for PhysX to have any.
+    """The mesh's surface; a plate where PhysX finds it too thin.
 
-    For PhysX a triangle has one side, while real meshes look either way or are open sheets.
+    For PhysX a triangle has one side, but the faces of real meshes point either way or are open sheets.
     """
     faces = np.concatenate([mesh.faces, _other_sides(mesh)]).astype(np.uint32)
     try:
@@ -165,11 +165,11 @@ def _surface(mesh: Mesh) -> PhysxCollisionShapeTriangleMesh | PhysxCollisionShap
 
 
 def _other_sides(mesh: Mesh) -> NDArray[np.int64]:
-    """The faces [F, 3] turned over, without those that the mesh holds already, as many of the dataset's do."""
+    """The reversed faces [F, 3], without those that the mesh has already, as many of the dataset's meshes do."""
     number = np.unique(mesh.vertices.astype(np.float32), axis=0, return_inverse=True)[1].reshape(-1)
 
     def keys(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Faces by their corners' places, the lowest first: the same for the same side of the same triangle."""
+        """Faces as numbers of their corners, the lowest first: the same for the same side of the same triangle."""
         places = number[faces]
         first = places.argmin(1)[:, None]
         in_turn: NDArray[np.int64] = np.take_along_axis(places, (first + np.arange(3)) % 3, axis=1)

@@ -1,4 +1,4 @@
-"""What the task observes by the data contract's keys, batched over its E environments."""
+"""The task's observation by the data contract's keys, batched over its E environments."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def gripper_and_joint(
     force: Tensor,
     position: Tensor,
 ) -> Observation:
-    """Where the grippers are and what they hold, and the true joints to open.
+    """State of the grippers, and the true joints to open.
 
     Args:
         stages: the E environments.
-        poses: of each one's bodies (:meth:`~fb3d_rl.env.stage.Stage.poses`).
-        gripper: of all environments.
+        poses: poses of the bodies of each (:meth:`~fb3d_rl.env.stage.Stage.poses`).
+        gripper: the grippers of all environments.
         force: norm [E, 1] of the contact force on each gripper, N.
-        position: of each joint to open [E, 1], rad or m.
+        position: position [E, 1] of each joint to open, rad or m.
     """
 
     def tensor(rows: Any) -> Tensor:
@@ -70,14 +70,14 @@ def clouds(
     steps: Tensor,
     rendered: SapienCamera | None,
 ) -> Observation:
-    """What the cameras see, with its truth.
+    """The clouds of the cameras, with ground truth.
 
     Args:
         stages: the E environments.
-        poses: of each one's bodies.
+        poses: poses of the bodies of each.
         count: number N of points.
-        steps: control steps made [E]; the result is on this device.
-        rendered: SAPIEN's camera with the picture that it has taken; None for the ray caster.
+        steps: number of control steps made [E]; the result is on this device.
+        rendered: SAPIEN's camera after a capture; None for the ray caster.
     """
     each = [
         stage.observe(pose, count, int(steps[e]), None if rendered is None else rendered.cloud(e))

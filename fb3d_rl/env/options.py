@@ -39,37 +39,34 @@ class GripperOptions:
     distance: float = option(0.6, "distance of the hand's origin in front of the object at the start", "m")
 
     def start(self, bounds: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where the hand's origin is at the start [3] (m), in front of an object within ``bounds`` [2, 3] (m).
+        """The hand's origin at the start [3] (m), in front of an object within ``bounds`` [2, 3] (m).
 
-        The hand looks along the world's x axis.
+        The hand points along the world's x axis.
         """
         return np.array([bounds[0, 0] - self.distance, 0.0, 0.5 * (bounds[0, 2] + bounds[1, 2])])
 
 
 @dataclass(frozen=True)
 class SuctionOptions:
-    """The spring that stands for suction (supplement, II.C: a strong force between gripper and part)."""
+    """The spring that models suction (supplement, II.C: a strong force between gripper and part)."""
 
     hold: Literal["target", "any"] = option(
         "target",
         "what suction holds: the part to open only, or every movable part",
         null="any where policy.mask is none, else target",
     )
-    stiffness: float = option(45000.0, "of the spring between tip and part", "N/m")
-    damping: float = option(3000.0, "of the spring", "N s/m")
-    angular_damping: float = option(1.0, "of the hand's free turning about the anchor", "N m s/rad")
+    stiffness: float = option(45000.0, "stiffness of the spring between tip and part", "N/m")
+    damping: float = option(3000.0, "damping of the spring", "N s/m")
+    angular_damping: float = option(1.0, "damping of the hand's free rotation about the anchor", "N m s/rad")
     breaking_force: float = option(math.inf, "the spring's force above which suction is lost", "N")
     max_stretch: float = option(0.06, "the spring's length above which suction is lost", "m")
-    touch: float = option(0.002, "two surfaces that are closer than this, or press on each other, touch", "m")
-    reach: float = option(0.05, "how far from the tip's centre a finger may touch and still suck", "m")
+    touch: float = option(0.002, "surfaces closer than this, or with a contact impulse, count as touching", "m")
+    reach: float = option(0.05, "largest distance between tip and contact point at which suction engages", "m")
 
 
 @dataclass(frozen=True)
 class EnvOptions:
-    """The simulated task: its camera, where that may stand, and starts of trials that the environment draws itself.
-
-    ``points`` is the number N of points of an observed cloud.
-    """
+    """The simulated task. ``start`` is for trials that the environment draws itself, ``points`` is N of a cloud."""
 
     gripper: GripperOptions = group(GripperOptions)
     suction: SuctionOptions = group(SuctionOptions)
@@ -77,7 +74,7 @@ class EnvOptions:
     views: ViewRange = ViewRange()
     start: Start = "reference"
     points: int = 1200
-    horizon: int = option(150, "after which an episode is truncated", "control steps", "[1, inf)")
+    horizon: int = option(150, "length at which an episode is truncated", "control steps", "[1, inf)")
     success: float = option(0.1, "normalized distance below which a part is open")
     sim_freq: int = option(100, "physics steps per second", "Hz")
     control_freq: int = option(20, "control steps per second; divides sim_freq", "Hz", "[1, inf)")
@@ -98,8 +95,8 @@ class Trial:
         object: the object's id.
         link: index of the link to open.
         start: joint state [J] (rad or m) in the order of the object's ``movable``.
-        view: where the camera stands.
-        seed: of the random draws within the episode.
+        view: the camera's viewpoint.
+        seed: seed of the random draws within the episode.
         goal: position (rad or m) that the part's joint is to reach; None for fully open.
     """
 
@@ -111,7 +108,7 @@ class Trial:
     goal: float | None = None
 
     def cloud_rng(self, step: int = 0) -> np.random.Generator:
-        """Draws the cloud after so many control steps: one for each, so that a restored state sees the same again."""
+        """The generator of the cloud after ``step`` control steps; a restored state sees the same cloud."""
         return np.random.default_rng([self.seed, step])
 
     def __str__(self) -> str:
@@ -119,7 +116,7 @@ class Trial:
 
 
 def drawn_fraction(start: Start, rng: np.random.Generator) -> float | None:
-    """How far a part is open at the start of a trial, for :func:`default_trial`; draws for "random" alone."""
+    """How far a part is open at the start of a trial, for :func:`default_trial`; draws for "random" only."""
     if start == "random":
         return float(rng.uniform(0.0, 0.9))
     return 0.0 if start == "closed" else None
@@ -139,14 +136,14 @@ def default_trial(
         obj: the object.
         link: the link to open; the first openable one unless given.
         view: the camera's view; from the front and 30 degrees above unless given.
-        seed: of the random draws within the episode.
-        fraction: how far the part is open at the start, where it is not the protocol's.
-        goal: how far it is to be open at the end, a fraction, too; None for fully.
+        seed: seed of the random draws within the episode.
+        fraction: how far the part is open at the start; the protocol's share unless given.
+        goal: how far it is to be open at the end, a fraction; None for fully open.
 
     Raises:
         UserError: nothing of the object can be opened.
     """
-    # Imports torch, which takes seconds that a configuration's checks do not have.
+    # Imported late: it imports torch, which takes seconds, and the configuration's checks need none of it.
     from fb3d_rl.kinematics.opening import openable_links, opening_range, start_fraction
 
     if link is None:

@@ -9,7 +9,7 @@ from fb3d_rl.env.stage import Stage
 
 
 class Progress:
-    """What the metrics of E environments follow from, besides their joint states [E, J], padded on the right.
+    """What the metrics of E environments need besides their joint states [E, J], which are padded on the right.
 
     Args:
         envs: E.
@@ -48,12 +48,12 @@ class Progress:
 
         Returns:
             "normalized_distance" [E, 1], "contact" [E, 1] (suction has held the part), "held_opened" [E, 1] (a part
-            that suction has held is open, be it the one to open or another) and "success" [E].
+            that suction has held is open, the target or another) and "success" [E].
         """
         signed = (self._goal - positions) / (self._goal - self._start)
-        # Past the limit, by the solver's slack, a part is open; past a goal within the range it has missed it.
+        # A part past its limit (by the solver's slack) is open; one past a goal within its range has missed it.
         distances = torch.where(self._opens, signed.clamp_min(0.0), signed.abs())
-        opened = distances < self._success  # not a number, and so not open, where there is nothing to open
+        opened = distances < self._success  # NaN, so False, where nothing opens
         return {
             "normalized_distance": distances.gather(1, self.target),
             "contact": self.held.gather(1, self.target),

@@ -21,7 +21,7 @@ class TrialSource:
 
     Args:
         objects: the objects.
-        link: name of the link to open, where it is always the same.
+        link: name of the link to open; any unless given.
         options: the task's constants.
 
     Raises:
@@ -45,7 +45,7 @@ class TrialSource:
             UserError: there is none.
         """
         if name not in self.objects:
-            raise UserError(f"the trial's object {name!r} is none of the environment's {len(self.objects)}")
+            raise UserError(f"the trial's object {name!r} is not among the environment's {len(self.objects)} objects")
         if name not in self._models:
             self._models[name] = Model(self.objects[name], self._options)
         return self._models[name]
@@ -54,9 +54,9 @@ class TrialSource:
         """Draw a trial, from a view that shows the part if one is found.
 
         Args:
-            rng: draws it.
-            name: id of the object, where it cannot be another.
-            view: the view, where it cannot be another.
+            rng: the generator that draws.
+            name: id of the object; any unless given.
+            view: the view; drawn unless given.
 
         Raises:
             UserError: nothing of the object can be opened.

@@ -1,4 +1,4 @@
-"""What stands in the scene of one environment: the object, the gripper's suction, and the running trial."""
+"""The content of one environment's scene: the object, the gripper's suction, and the running trial."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
 
 
 class Stage:
-    """One of the parallel environments: the trial that runs there, and the object as it stands in its scene.
+    """One of the parallel environments: its running trial, and the object in its scene.
 
     Attributes:
         trial: the running trial.
-        model: its object.
+        model: the trial's object.
         target: position of the part's joint in a joint state [J].
-        goal: position (rad or m) that this joint is to reach: the trial's, or that in which it is open.
-        sense: +1 if the goal lies where the joint opens, -1 if the part has to be closed to get there.
+        goal: position (rad or m) that this joint is to reach: the trial's goal, else fully open.
+        sense: +1 if the joint opens towards the goal, -1 if it closes towards it.
         sign: +1 if the joint opens towards higher positions, -1 if towards lower ones.
         moved: [L] bool, the links that the joint carries.
         direction: [J], ``sign`` at the target and 0 elsewhere.
@@ -46,9 +46,9 @@ class Stage:
         scene: the environment's own scene.
         links: the object's links in the simulator, in the order of ``object.links``.
         order: column of each of the J joints in the simulator's joint state.
-        static: what of the object collides as a surface.
+        static: the body with the static links' collision surfaces.
         gripper: the gripper's links by name.
-        suction: holds the part.
+        suction: the suction of its gripper.
     """
 
     scene: sapien.Scene
@@ -81,7 +81,7 @@ class Stage:
     def goals(self) -> NDArray[np.float64]:
         """Positions [J] (rad or m) in which each part counts as open, for the part to open its goal.
 
-        Not a number where a joint opens nothing, or starts fully open.
+        NaN where a joint opens nothing, or starts fully open.
         """
         goals = self.model.opened.copy()
         goals[self.target] = self.goal
@@ -132,7 +132,7 @@ class Stage:
             add_visuals(body.entity, meshes, i)
 
     def place(self, trial: Trial) -> Stage:
-        """Another trial with the object that is built here already."""
+        """The stage of another trial with the object that is already built."""
         stage = Stage(trial, self.model)
         for name in ("scene", "links", "order", "static", "gripper", "suction"):
             setattr(stage, name, getattr(self, name))
@@ -156,7 +156,7 @@ class Stage:
             options=options,
         )
 
-    # ------------------------------------------------------------------------------------------- what there is
+    # ------------------------------------------------------------------------------------------- observation
 
     def poses(self) -> NDArray[np.float64]:
         """World poses [L + 3, 4, 4] of the object's links, then of the gripper's hand and fingers."""
@@ -169,13 +169,13 @@ class Stage:
         step: int,
         seen: tuple[NDArray[np.float64], NDArray[np.int64]] | None = None,
     ) -> dict[str, Tensor]:
-        """What the camera sees, and the ground truth of it (:meth:`fb3d_rl.scene.observer.Cloud.with_truth`).
+        """The camera's cloud with its ground truth (:meth:`fb3d_rl.scene.observer.Cloud.with_truth`).
 
         Args:
-            poses: of :meth:`poses`.
+            poses: the result of :meth:`poses`.
             count: number N of points.
-            step: control steps made.
-            seen: points and links where SAPIEN's camera has taken the picture.
+            step: number of control steps made.
+            seen: points and links of SAPIEN's picture; the ray caster takes one unless given.
         """
         rng = self.trial.cloud_rng(step)
         return observe(self.model, poses, self.trial.view, count, rng, seen).with_truth(self.direction)

@@ -1,4 +1,4 @@
-"""A ManiSkill environment of stages: how its scenes are built, seen and drawn, whatever the task is."""
+"""A ManiSkill environment of stages: how its scenes are built, observed and drawn, independent of the task."""
 
 from __future__ import annotations
 
@@ -27,7 +27,9 @@ from fb3d_rl.env.stage import Stage
 from fb3d_rl.env.suction import ContactImpulses
 from fb3d_rl.errors import UserError
 
-logger.addFilter(lambda record: "does not support rendering" not in record.getMessage())  # it draws without
+logger.addFilter(
+    lambda record: "does not support rendering" not in record.getMessage()
+)  # pictures are drawn without it
 
 PICTURE = 512
 """Width and height (pixels) of what ``render()`` returns."""
@@ -36,7 +38,7 @@ PICTURE = 512
 class StagedEnv(BaseEnv):
     """Parallel scenes, each of which a stage fills: an object and the gripper before a camera.
 
-    Whoever derives from it sets ``options`` before it is initialized and ``stages`` before it is reset.
+    A derived class sets ``options`` before it is initialized and ``stages`` before it is reset.
     """
 
     agent: FloatingSuctionGripper
@@ -44,7 +46,7 @@ class StagedEnv(BaseEnv):
     options: EnvOptions
     """The task's constants."""
     stages: list[Stage]
-    """What stands in each of the E environments."""
+    """The content of each of the E environments."""
 
     @property
     def _default_sim_config(self) -> SimConfig:
@@ -93,7 +95,7 @@ class StagedEnv(BaseEnv):
         return self.articulation.get_qpos().gather(1, self._columns)
 
     def contact_impulses(self) -> ContactImpulses:
-        """A reader of the contacts of all environments for where the simulator tells no contact points."""
+        """A reader of the contacts of all environments for simulators without contact points."""
         return ContactImpulses(
             self.scene,
             self.agent.robot,

@@ -23,7 +23,7 @@ Vector = NDArray[np.float64]
 
 @dataclass
 class Contacts:
-    """What a physics step's contacts say of one gripper.
+    """The contacts of one gripper in a physics step.
 
     Attributes:
         impulse: net impulse [3] on the gripper, N s, world.
@@ -35,9 +35,9 @@ class Contacts:
 
 
 class ContactImpulses:
-    """Contacts of all environments where the simulator tells impulses but no points (on CUDA).
+    """Contacts of all environments where the simulator gives impulses but no points (on CUDA).
 
-    A finger that presses on a part is taken to touch it at the tip's centre.
+    A finger that presses on a part counts as touching it at the tip's centre.
 
     Args:
         scene: the scene of all environments.
@@ -72,14 +72,14 @@ class ContactImpulses:
     def read(self) -> list[Contacts]:
         """The contacts of the physics step that was just made, one entry for each environment."""
         net = self._robot.get_net_contact_impulses(self._body).sum(1).double().cpu().numpy()
-        found = [Contacts(impulse, {}) for impulse in net]
+        contacts = [Contacts(impulse, {}) for impulse in net]
         for k, view in enumerate(self._views):
             pairs = [self._scene.get_pairwise_contact_impulses(finger, view) for finger in self._fingers]
             pressed = torch.stack(pairs).norm(dim=-1).amax(0).cpu() > 0
             for e in pressed.nonzero().flatten().tolist():
                 tip = np.asarray(self._tool._objs[e].entity_pose.p, dtype=np.float64)
-                found[e].touches.setdefault(self._numbers[e][min(k, len(self._numbers[e]) - 1)], [tip])
-        return found
+                contacts[e].touches.setdefault(self._numbers[e][min(k, len(self._numbers[e]) - 1)], [tip])
+        return contacts
 
 
 class Suction:
@@ -131,8 +131,8 @@ class Suction:
         return float(np.linalg.norm(on_tool - on_part))
 
     def contacts(self) -> Contacts:
-        """The contacts of the physics step that was just made, where the simulator tells points (on the CPU)."""
-        found = Contacts(np.zeros(3), {})
+        """The contacts of the physics step that was just made, where the simulator gives points (on the CPU)."""
+        contacts = Contacts(np.zeros(3), {})
         for contact in self._scene.physx_system.get_contacts():
             first, second = contact.bodies
             if first in self._body:
@@ -143,13 +143,13 @@ class Suction:
                 continue
             points = contact.points
             for point in points:
-                found.impulse += sign * point.impulse
+                contacts.impulse += sign * point.impulse
             number = self._numbers.get(other)
             if number is not None and own in self._fingers and not self.attached:
                 touches = self._touches(points)
                 if touches:
-                    found.touches.setdefault(number, []).extend(touches)
-        return found
+                    contacts.touches.setdefault(number, []).extend(touches)
+        return contacts
 
     def update(self, contacts: Contacts) -> None:
         """Hold, keep or lose a part after a physics step with these contacts."""
@@ -159,12 +159,12 @@ class Suction:
             if stretch > self.options.max_stretch or stretch * self.options.stiffness > self.options.breaking_force:
                 self.release()
             return
-        found = contacts.touches
-        if found:
+        touches = contacts.touches
+        if touches:
             # The part with the touch nearest to the tip's centre; ties go to the lower number.
             tip = np.asarray(self._tool.entity_pose.p, dtype=np.float64)
-            number = min(found, key=lambda n: (min(np.linalg.norm(p - tip) for p in found[n]), n))
-            where = np.mean(found[number], axis=0)
+            number = min(touches, key=lambda n: (min(np.linalg.norm(p - tip) for p in touches[n]), n))
+            where = np.mean(touches[number], axis=0)
             self.hold(
                 number,
                 _to_local(self._tool.entity_pose, where),

@@ -39,7 +39,7 @@ class OpenArticulatedEnv(StagedEnv):
     A floating suction gripper, commanded by eight velocities, opens the given part (a door, a drawer, a lid ...) of an
     object whose base is fixed. It sees the object as a cloud of points from one camera. Suction holds the part as
     soon as a finger touches it. Contact between gripper, object and ground is physical; the object's parts do not
-    collide with each other. What cannot move collides as the surface of its meshes, what moves as their convex hulls.
+    collide with each other. Static links collide as the surface of their meshes, moving ones as convex hulls.
 
     **Randomizations:**
     - the object, and which of its parts is to be opened (``link`` fixes the part)
@@ -58,11 +58,10 @@ class OpenArticulatedEnv(StagedEnv):
       ``options.horizon`` control steps.
 
     Args:
-        objects: what stands in the scene: objects, a PartNet-Mobility folder of one object or of many; a few procedural
-            objects unless given.
+        objects: objects, or a PartNet-Mobility folder of one or of many; a few procedural objects unless given.
         options: the task's constants.
         split: of a folder of many objects, those of this split, category or id (a name or a list).
-        link: name of the link to open, where it is always the same.
+        link: name of the link to open; any unless given.
         num_envs: environments that run side by side; more than one need CUDA.
         kwargs: for ManiSkill's ``BaseEnv``. ``obs_mode`` is "pointcloud", "rgbd" ("rgb" [H, W, 3] uint8 and "depth"
             [H, W, 1] float32, m, in place of points; needs Vulkan), "state" (flat), "state_dict" or "none";
@@ -123,7 +122,7 @@ class OpenArticulatedEnv(StagedEnv):
 
     @property
     def max_episode_steps(self) -> int:
-        """The horizon, by the name under which ManiSkill's vector environment looks for it."""
+        """The horizon, under the name that ManiSkill's vector environment reads."""
         return self.options.horizon
 
     # ------------------------------------------------------------------------------------------------ reset
@@ -140,7 +139,7 @@ class OpenArticulatedEnv(StagedEnv):
 
         Raises:
             UserError: a trial names an object or a part that does not exist or cannot be opened, or only some
-                environments are reset and one of them shall get another object.
+                environments are reset and one of them gets another object.
         """
         options = dict(options or {})
         if seed is not None:
@@ -234,7 +233,7 @@ class OpenArticulatedEnv(StagedEnv):
         return self._progress.metrics(self.joint_positions())
 
     def get_info(self) -> dict[str, Any]:
-        """ManiSkill's, with a count of steps that does not go on counting."""
+        """ManiSkill's, with a copy of the count of steps, which ManiSkill changes in place."""
         return super().get_info() | {"elapsed_steps": self._elapsed_steps.clone()}
 
     def compute_normalized_dense_reward(self, obs: Any, action: Tensor, info: dict[str, Any]) -> Tensor:

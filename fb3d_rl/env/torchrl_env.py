@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 class ManiSkillEnv(EnvBase):
     """Wraps any ManiSkill environment, batched over its E parallel scenes.
 
-    A step's TensorDict holds under "next" the observation, whatever tensors [E, ...] the environment's ``info`` has
+    A step's TensorDict holds under "next" the observation, all tensors [E, ...] of the environment's ``info``
     ("success", "fail", "elapsed_steps" ...), "reward" [E, 1] and "done" = "terminated" or "truncated" [E, 1]. A dict
     of observations keeps its keys, a flat one becomes "observation"; an entry with one number per scene has shape
     [E, 1]. The specs are those of the first reset. A "_reset" mask [E, 1] resets the marked scenes only.
@@ -116,7 +116,7 @@ class ManiSkillEnv(EnvBase):
         return TensorDict._new_unsafe(source=entries, batch_size=self.batch_size, device=self.device)
 
     def _entry(self, value: Tensor) -> Tensor:
-        # A copy, since ManiSkill hands out buffers of its own.
+        # A copy, since ManiSkill returns its own buffers.
         return (value[:, None] if value.ndim == 1 else value).clone()
 
 
@@ -139,7 +139,7 @@ class TrialEnv(ManiSkillEnv):
     def set_trials(self, trials: Iterable[Trial]) -> None:
         """Let each further reset start the next of ``trials``.
 
-        Once they have run out, a reset leaves the scene as it is: it costs nothing, and what follows is no trial. Give
+        Once they have run out, a reset does not change the scene and starts no trial. Give
         ``itertools.cycle(trials)`` to start over. Without any call of this method the task draws its trials.
         """
         self._trials = enumerate(trials)
@@ -161,7 +161,7 @@ class TrialEnv(ManiSkillEnv):
         return self._start(scenes[: len(given)], {"trials": [trial for _, trial in given]})
 
     def _entry(self, value: Tensor) -> Tensor:
-        return value[:, None] if value.ndim == 1 else value  # this task hands out no buffers
+        return value[:, None] if value.ndim == 1 else value  # this task returns no buffers of its own
 
     def _read(self, obs: Any, info: dict[str, Any]) -> TensorDictBase:
         self._seen = obs, info
@@ -195,7 +195,7 @@ def _specs_of(sample: TensorDictBase) -> Composite:
 
 
 def _stand_in() -> ArticulatedObject:
-    """A block that slides out of another: what an environment shows before its first trial."""
+    """A block that slides out of another: the object of an environment before its first trial."""
     block = trimesh.creation.box((0.2, 0.2, 0.2))
     back, front = (
         (Mesh(np.asarray(block.vertices) + [x, 0.0, 0.1], np.asarray(block.faces, dtype=np.int64)),)
@@ -207,10 +207,10 @@ def _stand_in() -> ArticulatedObject:
 
 
 def require_simulator(otherwise: str = "leave out the trials: evaluation.trials=0") -> None:
-    """Import the simulator, so that a machine without it says so before any work.
+    """Import the simulator, so that a machine without it fails before any work.
 
     Args:
-        otherwise: what can be done without it.
+        otherwise: what to do without it, for the message.
 
     Raises:
         UserError: ManiSkill or SAPIEN is not installed, or lacks a library of the system.
@@ -245,7 +245,7 @@ def make_env(
     from fb3d_rl.env.task import OpenArticulatedEnv
 
     if kwargs.get("num_envs", 1) == 1:
-        # The specs are those of any object. One of the given that cannot be built would cost more here than its trial.
+        # All objects have the same specs. A given object that cannot be built would fail here, not only in its trial.
         link = kwargs.pop("link", None)
         task = OpenArticulatedEnv([_stand_in()], options, **kwargs)
         env = TrialEnv(task)

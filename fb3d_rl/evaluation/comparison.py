@@ -6,10 +6,10 @@ Definitions
     An *entry* is one row of the comparison: a policy with its trials of all seeds. The policy that a run is about
     is an entry of its group. Other policies of a run (the expert, a given ArtFlowNet) are repeated by many runs:
     they are one entry with those of another group if both have trials in common and every one of these ended alike;
-    what ended otherwise stands apart under the name of its group.
-    Two rows are of the same *trial* if their keys are equal, which tell the object's content, part, start, goal, view
-    and what suction may hold (:func:`fb3d_rl.rollout.trials.trial_key`). Rows of earlier versions have no key: they
-    are of the same trial if object, part and seeds are the same and the runs' settings of all that a key tells are.
+    else they are an entry of their own under the name of their group.
+    Two rows are of the same *trial* if their keys are equal, which are digests of the object's content, part, start,
+    goal, view and what suction may hold (:func:`fb3d_rl.rollout.trials.trial_key`). Rows of earlier versions have no
+    key: they are of the same trial if object, part, seeds and the runs' settings of all that enters a key are the same.
 
 Intervals
     As in :mod:`fb3d_rl.evaluation.intervals`: an object is the unit, with all its trials, those of all seeds, since
@@ -32,21 +32,20 @@ from fb3d_rl.evaluation.tables import CONTACT, DECISION, DISTANCE, SUCCESS, Metr
 from fb3d_rl.rollout.rows import TrialRow, policies
 
 METHOD = (
-    ("Interval", "95 %, with an object as the unit: its trials, over all seeds, are no more objects. It tells how the "
-     "mean would vary with other objects, for the networks as they were trained; how it varies with training is the "
-     "range over seeds."),
-    ("Seeds", "of the runs that stand behind a row. Runs of launch/train.py are trainings of their own; those of "
+    ("Interval", "95 %, with an object as the unit: its trials, over all seeds, count as one. It is for the mean over "
+     "other objects with the same trained networks; the range over seeds shows how the mean varies with training."),
+    ("Seeds", "of the runs of a row. Runs of launch/train.py are trainings of their own; those of "
      "launch/evaluate.py share the training of their checkpoint."),
     ("Range over seeds", "the lowest and the highest seed's instance mean."),
     ("Repeats", "runs repeat the expert and other baselines. Trials that ended alike in all runs count once; "
-     "a policy whose repeats differ stands in several rows."),
+     "a policy whose repeats differ has several rows."),
     ("Difference", "between two policies on the trials that both ran (same object, part, start, goal, view and "
      "suction), trial by trial, as a mean over objects; its interval has objects as the unit likewise. Where all are "
-     "tied, it says how many could differ unseen."),
+     "tied, it bounds the share of other objects that could differ."),
     ("Labels", "steps labelled by the expert that the policy learned from, mean over seeds; expert steps: share of "
      "those steps that the expert also made."),
 )  # fmt: skip
-"""How the numbers of a comparison come about: (term, meaning)."""
+"""Definitions of a comparison's numbers: (term, meaning)."""
 
 BASELINES = ("expert", "bc")
 """Policies that the others are compared with."""
@@ -55,7 +54,7 @@ DIFFERENCES = (SUCCESS, CONTACT, DISTANCE)
 
 _NOT_COMPARED = ("seed", "resume")
 _MAX_KEYS = 3
-"""Settings in a label; runs that differ in more are told apart by their folders."""
+"""Settings in a label; runs that differ in more are named by their folders."""
 
 TrialKey = tuple[int | None, str, int]
 """Run seed, the trial's key, and a count of the rows that have the same before this one."""
@@ -202,7 +201,7 @@ def _groups(runs: Sequence[Run]) -> list[Group]:
         for others, members, folders in found:
             same = next((other for other in members if other.seed == run.seed), None)
             fits = same is None or (same.rows == run.rows and same.flow == run.flow)
-            # Without a configuration nobody knows whether the seed is all that differs.
+            # Without a configuration other settings may differ, too.
             if settings and others == settings and fits:
                 members += [run] if same is None else []
                 folders.append(names[run.path])
@@ -210,10 +209,10 @@ def _groups(runs: Sequence[Run]) -> list[Group]:
         else:
             found.append((settings, [run], [names[run.path]]))
     policies_ = [_about(members[0], settings, folders[0]) for settings, members, folders in found]
-    told = _labels(policies_, [settings for settings, _, _ in found], [folders[0] for _, _, folders in found])
+    titles = _labels(policies_, [settings for settings, _, _ in found], [folders[0] for _, _, folders in found])
     return [
         Group(label, policy, sorted(members, key=lambda run: -1 if run.seed is None else run.seed), settings, folders)
-        for label, policy, (settings, members, folders) in zip(told, policies_, found, strict=True)
+        for label, policy, (settings, members, folders) in zip(titles, policies_, found, strict=True)
     ]
 
 

@@ -51,7 +51,7 @@ class Protocol:
         seed: base seed of trials and samples.
         schedule: starts, goals and repetitions of the trials.
         decision_seconds: time limit of a decision, s; None for none.
-        resume: go on from the rows that the run folder holds, those of the same trials and policies.
+        resume: keep the run folder's rows, which have to be of the same trials and policies.
         device: where the flow network is measured. Policies decide on the CPU, in the workers, so that trials do not
             depend on it.
     """
@@ -89,13 +89,13 @@ def evaluate(
         policies: name -> policy.
         protocol: what is evaluated.
         facts: entries for summary.json (seed, command, git revision ...).
-        net: the flow network to measure, on ``protocol.device``; itself it stays where it is.
+        net: the flow network to measure, on ``protocol.device``, as a copy.
 
     Returns:
         One row for each scheduled trial and policy.
 
     Raises:
-        UserError: it is to go on from rows of other trials or policies.
+        UserError: the rows to resume from are of other trials or policies.
     """
     numbers: dict[str, Any] = dict(facts)
     lost = facts.get(LOST_GEOMETRY, {}) | lost_geometry(obj for obj, _ in objects)
@@ -115,12 +115,12 @@ def evaluate(
     shown = [obj for obj, _ in objects if obj.id in used]
     named = {obj.id: obj for obj in shown}
     keys = [trial_key(named[item.trial.object], item.trial, protocol.env.suction.hold) for item in scheduled]
-    found = _rows_before(out / "rows.csv", policies, keys) if protocol.resume and scheduled else {}
-    times = DecisionTimes(out, [row for done in found.values() for row in done.values()])
+    earlier = _rows_before(out / "rows.csv", policies, keys) if protocol.resume and scheduled else {}
+    times = DecisionTimes(out, [row for done in earlier.values() for row in done.values()])
     rows: list[TrialRow] = []
     with progress_bars() as bar:
         for name, policy in policies.items() if scheduled else ():
-            done = found.get(name, {})
+            done = earlier.get(name, {})
             task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
             keep = partial(_keep, out / "rows.csv", rows, done, partial(bar.advance, task))
             _run(name, policy, shown, scheduled, protocol, done, keep, times)
@@ -144,7 +144,7 @@ def evaluate(
 
 
 def progress_bars() -> Progress:
-    """Bars of long work: what, how much of it is done, and how long the rest will take."""
+    """Progress bars with a description, counts and the remaining time."""
     return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
 
 
@@ -156,27 +156,29 @@ def _rows_before(
     Raises:
         UserError: a row is of another trial than is scheduled under its number, or of another policy.
     """
-    found: dict[str, dict[int, TrialRow]] = {name: {} for name in policies}
+    rows: dict[str, dict[int, TrialRow]] = {name: {} for name in policies}
     digests = {name: policy_digest(policy) for name, policy in policies.items()}
     for row in read_trials(path) if path.is_file() else []:
         of_row = f"{row.policy} with {row.category} {row.object}"
-        mend = "evaluate in another folder: hydra.run.dir=DIR"
+        remedy = "evaluate in another folder: hydra.run.dir=DIR"
         if row.trial >= len(keys) or row.key != keys[row.trial]:
-            raise UserError(f"{path} holds trial {row.trial}, {of_row}, which is not the one that is scheduled; {mend}")
+            raise UserError(
+                f"{path} holds trial {row.trial}, {of_row}, which is not the one that is scheduled; {remedy}"
+            )
         if row.policy_digest != digests.get(row.policy):
             raise UserError(
-                f"{path} holds a trial of {of_row}, run by other weights or options than this evaluation has; {mend}"
+                f"{path} holds a trial of {of_row}, run by other weights or options than this evaluation has; {remedy}"
             )
-        found[row.policy][row.trial] = row
-    return found
+        rows[row.policy][row.trial] = row
+    return rows
 
 
 class DecisionTimes:
-    """How long decisions took in wall time, for each trial, kept beside the rows: they differ between two runs.
+    """Wall times of the decisions of each trial; not in the rows, since they differ between two runs.
 
     Args:
         out: the run folder.
-        rows: whose times are taken over from there.
+        rows: rows whose times are kept from an earlier run.
     """
 
     FILE = "decision_times.jsonl"
@@ -193,7 +195,7 @@ class DecisionTimes:
             write_text(self._path, "".join(json.dumps(line) + "\n" for line in kept))
 
     def add(self, policy: str, trial: int, seconds: Sequence[float]) -> None:
-        """Take the times [T] (s) of a trial."""
+        """Add the times [T] (s) of a trial."""
         rounded = [round(value, 6) for value in seconds]
         line = {"policy": policy, "trial": trial, "seconds": rounded}
         with self._path.open("a", encoding="utf-8") as file:
@@ -216,7 +218,7 @@ def _run(
     keep: Callable[[TrialRow], None],
     times: DecisionTimes,
 ) -> None:
-    """Run the trials that are not done; each row goes to ``keep``, and what its decisions took to ``times``."""
+    """Run the trials that are not done; each row goes to ``keep``, the wall times of its decisions to ``times``."""
     left = [number for number in range(len(scheduled)) if number not in done]
     run_trials(
         name, policy, objects, [scheduled[number] for number in left], protocol.env,
@@ -228,7 +230,7 @@ def _run(
 def _keep(
     path: Path, before: Sequence[TrialRow], done: dict[int, TrialRow], advance: Callable[[], None], row: TrialRow
 ) -> None:
-    """Put a row among those of its policy, and all rows on disk."""
+    """Add a row to those of its policy, and write all rows."""
     done[row.trial] = row
     write_trials(path, [*before, *(done[number] for number in sorted(done))])
     advance()
@@ -243,7 +245,7 @@ def _measure_flow(
     """Rows of the target "part"; the numbers of the target "all" for summary.json; clouds for the report."""
     measured: list[FlowRow] = []
     extra: dict[str, Any] = {}
-    net = copy.deepcopy(net).to(protocol.device)  # the policies' own stays on the CPU
+    net = copy.deepcopy(net).to(protocol.device)  # the policies' network stays on the CPU
     sets = held_out_samples(objects, protocol.samples, protocol.samples_per_object, protocol.seed)
     for target, (samples, about) in sets.items():
         predicted = predict(net, samples, protocol.device)

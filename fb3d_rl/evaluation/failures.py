@@ -1,4 +1,4 @@
-"""How trials end: the stages that they went through, and why those failed that did."""
+"""How trials end: their stages, and the reasons of failures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from fb3d_rl.rollout.rows import (
 SUCCESS, SCHEDULED, TOUCHED, HELD = "success", "scheduled", "touched", "held"
 
 NOT_FAR = "held, but not opened far enough"
-"""What rows said of trials before they told stuck, wrong direction and timed out apart."""
+"""The failure in rows of versions that did not distinguish stuck, wrong direction and timed out."""
 
 ENDS = {
     SUCCESS: "#2f9e77",
@@ -38,16 +38,16 @@ ENDS = {
 """How trials end, from the best to the worst, with the colours of these ends."""
 
 _FORMER = {"held at the end": NOT_FAR}
-"""What early versions called an end."""
+"""Ends under their names in early versions."""
 
 _APART = (CRASHED, TOO_SLOW)
-"""Ends that tell nothing about the stages before."""
+"""Ends after which the earlier stages are unknown."""
 
 
 def end(row: TrialRow) -> str:
     """How a trial ended: "success", or why it failed.
 
-    Rows of early versions also tell how far the part was open ("lost hold, 34 % open"), which is left out here.
+    Rows of early versions also say how far the part was open ("lost hold, 34 % open"), which is left out here.
     """
     if row.success:
         return SUCCESS
@@ -68,7 +68,7 @@ def stages(row: TrialRow) -> tuple[str, ...]:
 
 
 def in_order(ends: Sequence[str]) -> dict[str, int]:
-    """Each of ``ends`` with how often it stands there, from the best to the worst, those that no list names last."""
+    """Each of ``ends`` with its count, from the best to the worst; unknown ends come last."""
     count = Counter(ends)
     known = [name for name in ENDS if name in count]
     return {name: count[name] for name in [*known, *sorted(count.keys() - ENDS.keys())]}

@@ -1,4 +1,4 @@
-"""What the log of a behaviour-cloning or DAgger run tells about labels: rounds and learning curves."""
+"""Rounds and learning curves over labels, from the log of a behaviour-cloning or DAgger run."""
 
 from __future__ import annotations
 

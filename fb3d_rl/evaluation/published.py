@@ -106,7 +106,7 @@ def _success(rows: Sequence[TrialRow]) -> Iterator[str]:
         "",
         "The last two columns count as FlowBotHD does, only trials that made contact, and are to be set beside each "
         "other; the measure here is all trials, where no contact is a failure. Test's categories are new to a network "
-        "that train_train alone has trained; FlowBotHD trained on them. An instance mean is over objects for ours, "
+        "that was trained on train_train only; FlowBotHD trained on them. An instance mean is over objects for ours, "
         "over trials for FlowBotHD's.",
     )
     yield from ("", "| | n | class mean | instance mean | with contact | class mean | instance mean |")
@@ -160,7 +160,7 @@ def _differences(run: Run) -> Iterator[str]:
 
 
 def _split_sizes() -> Counter[tuple[str, str]]:
-    """How many objects of each category UMPNet's lists have in each split."""
+    """Number of objects of each category and split in UMPNet's lists."""
     listed = json.loads(UMPNET_SPLIT.read_text())
     return Counter(
         {

@@ -67,7 +67,7 @@ class Run:
 
     @property
     def seed(self) -> int | None:
-        """The run's seed, where summary.json or config.yaml tells it."""
+        """The run's seed, if summary.json or config.yaml has it."""
         seed = self.summary.get("seed")
         if seed is None and self.settings.get("seed", "").isdigit():
             return int(self.settings["seed"])

@@ -31,8 +31,8 @@ class Metric:
         label: its name for people.
         short: the same in at most 7 characters, for the terminal's table.
         percent: shown in percent, otherwise with ``decimals``.
-        bounds: lowest and highest value that is possible.
-        share: the mean of a yes or no of each trial.
+        bounds: lowest and highest possible value.
+        share: whether a trial's value is yes or no, so that the mean is a share.
         decimals: of a value that is not shown in percent.
     """
 
@@ -68,14 +68,14 @@ SUCCESS = Metric("success_rate", "success", "success", percent=True, bounds=UNIT
 MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, bounds=UNIT, share=True)
 DISTANCE = Metric("normalized_distance", "normalized distance", "dist.", bounds=UNIT)
 HELD = Metric("held_opened_rate", "opened what it held", "held", percent=True, bounds=UNIT, share=True)
-"""Of policies that see no part mask: success by whatever part suction held."""
+"""Of policies without part mask: success with any part that suction held."""
 TRIAL = (CONTACT, SUCCESS, MOTION_ONLY, DISTANCE)
 STEPS = Metric("steps_to_success", "steps to success", "steps", bounds=_POSITIVE, decimals=0)
 SECONDS = Metric("seconds_to_success", "simulated seconds to success", "seconds", bounds=_POSITIVE, decimals=1)
 PATH = Metric("path_length", "way of the tip, m", "way", bounds=_POSITIVE)
 LOST = Metric("times_lost", "times that hold was lost", "lost", bounds=_POSITIVE)
 EFFORT = (STEPS, SECONDS, PATH, LOST)
-"""What it took; of rows that were recorded before these numbers there are none."""
+"""The effort of trials; rows of earlier versions lack these numbers."""
 DECISION = Metric("time/decision_ms", "wall time of a decision, ms", "ms", decimals=1)
 """Median over the decisions of a run, on the machine that it ran on; rows do not hold it."""
 
@@ -112,7 +112,7 @@ def measure(rows: Iterable[TrialRow] | Iterable[FlowRow], metric: Metric) -> Mea
 
 
 def counted(rows: Iterable[TrialRow] | Iterable[FlowRow], metric: Metric) -> int:
-    """How many of ``rows`` have a value of ``metric``."""
+    """Number of ``rows`` that have a value of ``metric``."""
     return sum(_VALUES[metric.key](row) is not None for row in rows)
 
 
@@ -120,7 +120,7 @@ def difference(pairs: Iterable[tuple[TrialRow, TrialRow]], metric: Metric) -> Me
     """Means of the first row's minus the second row's value, over the objects of ``pairs``.
 
     An object's value is the mean over its pairs, so that what makes an object hard for both rows of a pair cancels.
-    Where all objects are tied, the interval still says how many could differ unseen.
+    Where all objects are tied, the interval still bounds the share of other objects that could differ.
 
     Args:
         pairs: two policies' rows of one trial each; pairs of which either value is undefined do not count.
@@ -235,23 +235,20 @@ def has_flow(numbers: Mapping[str, Any]) -> bool:
 
 
 def trainings(numbers: Mapping[str, Any]) -> str:
-    """How many trainings stand behind a run's summary, for people; nothing where no policy was trained."""
+    """A note on the number of trainings in a run's summary; empty where no policy was trained."""
     if not has_flow(numbers) and {*policies_of(numbers)} <= {*untrained()}:
         return ""
-    return (
-        "One training (one seed) stands behind each trained policy: intervals tell what other objects would change, "
-        "not what another training would."
-    )
+    return "One training (one seed) per trained policy: the intervals are for other objects, not for another training."
 
 
 def effort_of(numbers: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    """Those of the policies ``names`` of which a summary tells what their trials took."""
+    """The policies among ``names`` whose effort a summary has."""
     keys = [metric.key for metric in (*EFFORT, DECISION)]
     return [name for name in names if any(numbers.get(f"{name}/{key}") is not None for key in keys)]
 
 
 def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
-    """What trials took, as a rich table with a row for each of the policies ``names``."""
+    """The effort of trials, as a rich table with a row for each of the policies ``names``."""
     table = Table(
         title="What it took, steps and seconds until success",
         title_justify="left",
@@ -293,19 +290,19 @@ _POLICIES_PER_TABLE = 2
 def tables(numbers: Mapping[str, Any]) -> list[Table]:
     """A summary as rich tables of at most 100 columns: one row per category, then class and instance mean.
 
-    The flow and two policies fit side by side; further policies get tables of their own. The last says what the trials
-    took.
+    The flow and two policies fit side by side; further policies get tables of their own. The last one is the
+    effort.
     """
     names = policies_of(numbers)
     chunks = [names[i : i + _POLICIES_PER_TABLE] for i in range(0, len(names), _POLICIES_PER_TABLE)]
     flow = has_flow(numbers)
     if not chunks and not flow:
         return []
-    found = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
+    listed = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
     if unmasked(numbers):
-        found.append(unmasked_table(numbers, unmasked(numbers)))
+        listed.append(unmasked_table(numbers, unmasked(numbers)))
     measured = effort_of(numbers, names)
-    return [*found, effort_table(numbers, measured)] if measured else found
+    return [*listed, effort_table(numbers, measured)] if measured else listed
 
 
 def _table(numbers: Mapping[str, Any], names: Sequence[str], flow: bool) -> Table:
@@ -357,8 +354,8 @@ def show(numbers: Mapping[str, Any], console: Console | None = None) -> None:
         console.width = max(console.width, 100)
     for table in tables(numbers):
         console.print(table)
-    if told := trainings(numbers):
-        console.print(told, style="dim", highlight=False)
+    if note := trainings(numbers):
+        console.print(note, style="dim", highlight=False)
 
 
 def number_rows(results: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, str, str]]:

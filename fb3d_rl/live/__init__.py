@@ -1,1 +1,1 @@
-"""An object in a person's hands: what is looked at and done (``session``), and the page in the browser (``page``)."""
+"""An interactive view of an object: its state and actions (``session``), and the page in the browser (``page``)."""

@@ -1,11 +1,11 @@
-"""The live page: a thin face of :class:`~fb3d_rl.live.session.Session` in the browser.
+"""The live page: the view of :class:`~fb3d_rl.live.session.Session` in the browser.
 
-It is made with viser, which serves sliders and a 3D scene from Python, tells where a mesh was clicked, and brings its
-own client, so that it works offline. Rerun's viewer shows what is logged to it but asks nothing of a person; plotly
-with Dash sends the whole figure anew for each move of a slider.
+It is made with viser, which serves sliders and a 3D scene from Python, reports clicks on meshes, and brings its own
+client, so that it works offline. Rerun's viewer takes no input; plotly with Dash sends the whole figure again for each
+move of a slider.
 
-viser calls back in threads of its own, but network and simulator run in one: a callback leaves a wish behind, and the
-loop that owns the session fulfils it. Of a slider's many positions only the last one counts.
+viser calls back in threads of its own, but network and simulator run in one: a callback queues a request, and the loop
+that owns the session runs it. Of a slider's many positions only the last one counts.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ def require_viser() -> Any:
 
 
 def serve(session: Session, port: int, until: Callable[[], bool] = lambda: False) -> None:
-    """Serve the page and fulfil what is wished there, until Ctrl-C.
+    """Serve the page and run its requests, until Ctrl-C.
 
     Args:
-        session: what is shown; it is closed in the end.
-        port: where to listen; where it is taken, the next free one is used. What is used is printed.
-        until: asked between wishes whether to end.
+        session: the session to show; it is closed at the end.
+        port: the port, or if it is taken the next free one; it is printed.
+        until: called between requests; True ends the page.
 
     Raises:
         UserError: viser is not installed.
@@ -94,12 +94,12 @@ class Page:
 
     Args:
         server: a ``viser.ViserServer``.
-        session: what is shown.
+        session: the session to show.
     """
 
     def __init__(self, server: Any, session: Session) -> None:
         self._server, self._session = server, session
-        self._wishes: dict[object, Callable[[], None]] = {}
+        self._requests: dict[object, Callable[[], None]] = {}
         self._wake = threading.Condition()
         self._playing = False
         self._part = -1
@@ -117,28 +117,28 @@ class Page:
         self._controls()
         self._draw()
 
-    # -------------------------------------------------------------------------------------------------- wishes
+    # -------------------------------------------------------------------------------------------------- requests
 
-    def _wish(self, key: object, fulfil: Callable[[], None]) -> None:
-        """Ask for something from any thread; a later wish of the same key takes its place."""
+    def _request(self, key: object, request: Callable[[], None]) -> None:
+        """Queue a request from any thread; it replaces an earlier one of the same key."""
         with self._wake:
-            self._wishes.pop(key, None)
-            self._wishes[key] = fulfil
+            self._requests.pop(key, None)
+            self._requests[key] = request
             self._wake.notify()
 
     def attend(self, patience: float = 0.5) -> None:
-        """Fulfil what is wished; wait at most ``patience`` s for a wish, or make a control step while it plays."""
+        """Run the queued requests; wait at most ``patience`` s for one, or make a control step while it plays."""
         with self._wake:
-            if not self._wishes and not self._playing:
+            if not self._requests and not self._playing:
                 self._wake.wait(patience)
-            wishes, self._wishes = list(self._wishes.values()), {}
+            requests, self._requests = list(self._requests.values()), {}
         begun = time.monotonic()
-        if not wishes and not self._playing:
+        if not requests and not self._playing:
             return
         try:
             self._say("")
-            for fulfil in wishes:
-                fulfil()
+            for request in requests:
+                request()
             if self._playing:
                 self._step()
         except UserError as error:
@@ -147,7 +147,7 @@ class Page:
         self._draw()
         if self._playing:  # no faster than the robot
             with self._wake:
-                if not self._wishes:
+                if not self._requests:
                     self._wake.wait(max(0.0, begun + self._session.period - time.monotonic()))
 
     def _step(self) -> None:
@@ -173,7 +173,7 @@ class Page:
             @handle.on_update
             def _(event: Any) -> None:
                 if event.client is not None:  # and not by this page itself
-                    self._wish(f"set {id(handle)}", lambda: self._change(lambda: set_to(event.target.value)))
+                    self._request(f"set {id(handle)}", lambda: self._change(lambda: set_to(event.target.value)))
 
         gui.set_panel_label(f"{session.obj.category} {session.obj.id}")
         names = {f"{session.obj.links[i].semantic} · {session.obj.links[i].name}": i for i in session.parts}
@@ -190,7 +190,7 @@ class Page:
             @buttons.on_click
             def _(event: Any) -> None:
                 button = str(event.target.value)
-                self._wish(object(), lambda: self._act(button))  # each press counts
+                self._request(object(), lambda: self._act(button))  # each press counts
 
             self._status = gui.add_markdown("")
             self._message = gui.add_markdown("")
@@ -199,7 +199,7 @@ class Page:
             self._shown = {name: gui.add_checkbox(LABELS[name], True) for name in reversed(session.flows)}
             self._shown["cloud"] = gui.add_checkbox("Points that the camera sees", True)
             for box in self._shown.values():
-                box.on_update(lambda event: self._wish("show", lambda: None))
+                box.on_update(lambda event: self._request("show", lambda: None))
         with gui.add_folder("Joints"):
             self._joints = []
             for j, (low, high) in enumerate(session.limits):
@@ -237,7 +237,7 @@ class Page:
             self._message.content = text
 
     def _welcome(self, client: Any) -> None:
-        """Stand a new guest where the object, its open parts and the hand are in sight."""
+        """Place a new visitor's camera so that the object, its open parts and the hand are in the picture."""
         session = self._session
         view = View(0.7 * session.view.azimuth - 15.0, 24.0)
         client.camera.up_direction = (0.0, 0.0, 1.0)
@@ -247,7 +247,7 @@ class Page:
     # ------------------------------------------------------------------------------------------------- drawing
 
     def _draw(self) -> None:
-        """Show the session's moment."""
+        """Draw the session's present state."""
         moment = self._session.moment
         with self._server.atomic():
             if self._part != self._session.link:
@@ -259,7 +259,7 @@ class Page:
             self._write(moment)
         self._server.flush()
 
-    def _mesh(self, name: str, meshes: Sequence[Mesh], color: Color, **look: Any) -> Any:
+    def _mesh(self, name: str, meshes: Sequence[Mesh], color: Color, **style: Any) -> Any:
         """One node of all ``meshes``, or none in place of an empty one."""
         meshes = [mesh for mesh in meshes if len(mesh.faces)]
         if not meshes:
@@ -269,11 +269,11 @@ class Page:
         vertices = np.concatenate([mesh.vertices for mesh in meshes])
         faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
         return self._server.scene.add_mesh_simple(
-            name, vertices.astype(np.float32), faces.astype(np.uint32), color=color, side="double", **look
+            name, vertices.astype(np.float32), faces.astype(np.uint32), color=color, side="double", **style
         )
 
     def _build(self) -> None:
-        """The object's links, of which those that open can be clicked."""
+        """Draw the object's links; those of the part to open can be clicked."""
         session = self._session
         self._part = session.link
         carried = session.obj.descendants(session.link)
@@ -285,7 +285,7 @@ class Page:
             self._bodies.append(body)
 
     def _clicked(self, event: Any) -> None:
-        self._wish("pick", lambda: self._session.pick(*_ray(event.client.camera, event.screen_pos)))
+        self._request("pick", lambda: self._session.pick(*_ray(event.client.camera, event.screen_pos)))
 
     def _place(self, moment: Moment) -> None:
         """Put the bodies where they are; the gripper is there in a trial only."""
@@ -321,7 +321,7 @@ class Page:
         )
 
     def _arrows(self, moment: Moment) -> None:
-        """The flows beside each other: every other of the points that move has an arrow of the one or of the other."""
+        """Draw the flows beside each other: the moving points have an arrow of one flow or the other in turn."""
         norms = np.max([np.linalg.norm(flow, axis=-1) for flow in moment.flows.values()], axis=0)
         moving = np.flatnonzero(norms > 0.1)[: len(moment.flows) * ARROWS]  # clouds are in random order
         for turn, (name, flow) in enumerate(moment.flows.items()):
@@ -333,7 +333,7 @@ class Page:
             self._mesh(f"/flow/{name}", meshes, COLORS[name])
 
     def _aim(self, moment: Moment) -> None:
-        """The contact point as a ball, an arrow along the pull, and a thin one from where the hand will stand."""
+        """The contact point as a ball, an arrow along the pull, and a thin one from the hand's standoff pose."""
         scene, contact, size = self._server.scene, moment.contact, self._session.size
         if contact is None:
             for name in ("point", "pull", "approach"):
@@ -346,7 +346,7 @@ class Page:
         self._mesh("/contact/approach", _arrow(contact.point + 1.25 * way, -way, 0.005 * size), GRIPPER)
 
     def _write(self, moment: Moment) -> None:
-        """Numbers and words, and the controls where they follow what happens."""
+        """Write the numbers and messages, and set the controls to the present state."""
         if moment.metrics:
             self._measured.content = (
                 f"Predicted: cosine **{moment.metrics['cosine']:.3f}** · RMSE **{moment.metrics['rmse']:.3f}**"
@@ -368,9 +368,9 @@ class Page:
 
 
 def _ray(camera: Any, place: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Origin (m) and direction [3] of the ray through a place in a guest's picture: columns and rows from 0 to 1.
+    """Origin (m) and direction [3] of the ray through a point in a visitor's picture: column and row from 0 to 1.
 
-    viser's events tell the ray as well, but not rightly in each of its versions.
+    viser's events have the ray as well, but it is wrong in some versions.
     """
     across, down = (2.0 * np.array(place) - 1.0) * math.tan(0.5 * camera.fov) * [camera.aspect, 1.0]
     rotation = quaternion_to_matrix(torch.as_tensor(np.asarray(camera.wxyz, dtype=np.float64))).numpy()
@@ -378,7 +378,7 @@ def _ray(camera: Any, place: tuple[float, float]) -> tuple[NDArray[np.float64], 
 
 
 def _status(moment: Moment, playing: bool) -> str:
-    """What is going on, in a line or two."""
+    """The state of the trial, in a line or two."""
     trial = moment.trial
     if trial is None:
         if moment.contact is None:

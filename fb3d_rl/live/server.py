@@ -1,7 +1,7 @@
-"""viser's server, for this machine alone: its page loads nothing from elsewhere, and it gives away its own files only.
+"""viser's server, for this machine only: its page loads nothing from the internet, and it serves its own files only.
 
-The page of viser 0.2 fetches Google Analytics, and its server answers a path with dots with whatever file it leads to.
-Versions from 1.0 on do neither, but want an older rich than ``requirements.lock`` holds.
+The page of viser 0.2 fetches Google Analytics, and its server follows paths with dots to files outside its
+folder. Versions from 1.0 on do neither, but want an older rich than ``requirements.lock`` holds.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from unittest.mock import patch
 
 HOST = "127.0.0.1"
-"""Only this machine reaches the page: whoever does may run the policy."""
+"""Only this machine reaches the page, since a visitor may run the policy."""
 
 
 def start_server(port: int, name: str) -> Any:
@@ -27,7 +27,7 @@ def start_server(port: int, name: str) -> Any:
         def __init__(self, **kwargs: Any) -> None:
             super().__init__(**{**kwargs, "http_server_root": _Client(kwargs["http_server_root"])})
 
-    # viser has no setting for the folder that it serves; so its web server is told of another one on the way.
+    # viser has no setting for the folder that it serves; so the folder is replaced in the call of its web server.
     with patch.object(infra, "WebsockServer", Closed), redirect_stdout(io.StringIO()):  # it has a banner of its own
         return viser.ViserServer(host=HOST, port=port, label=name, verbose=False)
 
@@ -42,7 +42,7 @@ class _Client:
         self._page.write_text(re.sub(r'<script[^>]*\bsrc="https?:[^>]*>\s*</script>', "", page), encoding="utf-8")
 
     def __truediv__(self, name: str) -> Path:
-        """Where the file of that name is; nowhere if it is none of the client's."""
+        """The path of the file of that name; one that does not exist if it is not the client's."""
         path = (self._root / name).resolve()
         if self._root not in path.parents:
             return Path(self._own.name) / "nowhere"

@@ -1,6 +1,6 @@
-"""One object in a person's hands: its joints, what the camera sees of it, the flow, the contact point, and a trial.
+"""An interactive view of one object: its joints, the camera's cloud, the flow, the contact point, and a trial.
 
-Nothing here knows of a page; the simulator is loaded when a trial begins.
+It does not depend on the page; the simulator is loaded when a trial begins.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
 
 FLOWS = {"true": ("privileged", "flow"), "predicted": ("prediction", "flow")}
-"""Where a policy can have its flow from: the true flow makes the expert."""
+"""The flows that a policy can act on; the expert acts on the true one."""
 
 PICK = 0.02
-"""Of the points that are at most this much (m) farther from a ray than the nearest one, the foremost is meant."""
+"""A click picks the foremost of the points that are at most this much (m) farther from its ray than the nearest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where the hand touches (m), which way it pulls there and on which side it stands (unit vectors), [3] each."""
+    """A contact [3] (m) with the unit vectors [3] of the pull and from the contact to the hand's standoff pose."""
 
     point: NDArray[np.float32]
     pull: NDArray[np.float32]
@@ -58,11 +58,11 @@ class Contact:
 
 @dataclass(frozen=True)
 class Progress:
-    """How a trial goes.
+    """State of a trial.
 
     Attributes:
         steps: control steps made.
-        phase: the policy's, one of :data:`fb3d_rl.policies.flow_policy.PHASES`.
+        phase: the policy's phase, one of :data:`fb3d_rl.policies.flow_policy.PHASES`.
         distance: normalized distance, 1 at the start and 0 at the joint's limit.
         attached: whether suction holds the part.
         success: whether the part counts as open.
@@ -79,7 +79,7 @@ class Progress:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """What there is to see.
+    """All that a page shows.
 
     Attributes:
         poses: T_world_body [L, 4, 4] of the links; in a trial [L + 3, 4, 4] with hand, left and right finger.
@@ -88,9 +88,9 @@ class Moment:
         points: the M points of the cloud [M, 3], m.
         part: [M], whether a point lies on the part to open.
         flows: the true and, with a network, the predicted flow [M, 3] by their names in :data:`FLOWS`.
-        metrics: of the prediction (:func:`fb3d_rl.flow.metrics.flow_metrics`); empty where there is nothing to measure.
-        contact: where the policy touches, or would; None where it has no such aim.
-        trial: how the trial goes; None if none runs.
+        metrics: errors of the prediction (:func:`fb3d_rl.flow.metrics.flow_metrics`); empty without one.
+        contact: the policy's contact; None where it has none.
+        trial: state of the trial; None if none runs.
     """
 
     poses: NDArray[np.float64]
@@ -105,10 +105,10 @@ class Moment:
 
 
 class Session:
-    """An object, the part of it to open, a joint state, a view, and at times a trial that the policy runs from there.
+    """An object, the part to open, a joint state, a view, and a trial of the policy if one runs.
 
-    It begins with the trial that an evaluation of the same seed runs with the object's first part. Whatever a person
-    changes ends a running trial, and is seen where the object stands then.
+    It begins with the trial that an evaluation of the same seed runs with the object's first part. A person's change
+    ends a running trial; the joints stay where they are.
 
     Args:
         obj: the object.
@@ -143,7 +143,7 @@ class Session:
         self._env: EnvBase | None = None
         self._base: TrialEnv | None = None
         self._points = samples.points
-        first = default_trial(obj)  # says so if nothing opens
+        first = default_trial(obj)  # raises if nothing opens
         self._trials = {item.trial.link: item.trial for item in schedule([(obj, "")], samples, seed)[0]}
         self.parts = self._object.openable
         """Links that open."""
@@ -167,23 +167,23 @@ class Session:
     def set_part(self, link: int) -> None:
         """Choose the part to open, with the joint state and the view that an evaluation would start from."""
         self._trial = self._trials.get(link) or default_trial(self.obj, link)
-        self._look()
+        self._observe()
 
     def set_joint(self, index: int, position: float) -> None:
         """Move joint ``index`` of the joint state [J] to a position, rad or m."""
         state = self.moment.qpos.copy()
         state[index] = np.clip(position, *self.limits[index])
         self._trial = replace(self._trial, start=tuple(state.tolist()))
-        self._look()
+        self._observe()
 
     def set_view(self, view: View) -> None:
-        """Put the camera elsewhere."""
+        """Set the camera's view."""
         self._trial = replace(self._trial, view=view, start=tuple(self.moment.qpos.tolist()))
-        self._look()
+        self._observe()
 
     def reset(self) -> None:
-        """Put everything back to where the trial began, or would begin."""
-        self._look()
+        """Set everything back to the start of the trial."""
+        self._observe()
 
     @property
     def link(self) -> int:
@@ -192,7 +192,7 @@ class Session:
 
     @property
     def view(self) -> View:
-        """Where the camera stands."""
+        """The camera's viewpoint."""
         return self._trial.view
 
     @property
@@ -202,7 +202,7 @@ class Session:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """The point [3] that the camera looks at, m."""
+        """The point [3] (m) in the middle of the camera's image."""
         return self._object.camera.centre
 
     @property
@@ -221,11 +221,11 @@ class Session:
         return 1.0 / self._env_options.control_freq
 
     def pick(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> None:
-        """Let the policy touch the point of the part that a ray meets, in place of the one that it would choose.
+        """Let the policy touch the point of the part that a ray hits, instead of its own choice.
 
         Args:
-            origin: where the ray begins [3], m.
-            direction: where it goes [3].
+            origin: start of the ray [3], m.
+            direction: direction of the ray [3].
 
         Raises:
             UserError: the part is not seen, does not move there, is held already, or the trial is over.
@@ -257,8 +257,8 @@ class Session:
 
     # ------------------------------------------------------------------------------------------------- what is seen
 
-    def _look(self) -> None:
-        """See the object as it stands at the start of the trial, without the simulator."""
+    def _observe(self) -> None:
+        """Observe the object at the start of the trial, without the simulator."""
         trial, posed = self._trial, self._object
         poses = posed.poses(trial.start)
         cloud = observe(posed, poses, trial.view, self._points, trial.cloud_rng())
@@ -299,7 +299,7 @@ class Session:
         )
 
     def _contact(self) -> Contact | None:
-        """Where the policy touches, or would if it began now."""
+        """The policy's contact, or the one that it would choose now."""
         phase = SELECT if self.trial is None else PHASES.index(self.trial.phase)
         if phase == SELECT:
             touch = (self._picked or self._choose())[0]
@@ -313,12 +313,12 @@ class Session:
         return Contact(point[0].numpy(), pull[0].numpy(), standoff[0].numpy()) if bool(pull.any()) else None
 
     def _shown(self) -> Tensor:
-        """The points [1, N] that the policy may touch: those of the part, or all if it is not told which they are."""
+        """The points [1, N] that the policy may touch: those of the part, or all if the policy gets no mask."""
         obs = self._frame["observation"]
         return obs["valid"] if self._policy_options.mask == "none" else obs["valid"] & obs["part_mask"]
 
     def _choose(self, avoid: Tensor | None = None) -> tuple[Touch, Touch]:
-        """The policy's choice of a contact point, or how it would touch the only point that is not to be avoided."""
+        """The policy's contact candidates; with ``avoid`` those at the points that are not avoided."""
         obs, options = self._frame["observation"], self._policy_options.contact
         shown = self._shown()
         flow = torch.where(shown[..., None], self._frame[FLOWS[self.flow]], 0.0)
@@ -358,7 +358,7 @@ class Session:
         self._seen(step_mdp(frame), over)
 
     def _begin(self) -> None:
-        require_simulator("look at flow and contact points alone")
+        require_simulator("use the page without running trials")
         if self._base is None or self._env is None:
             self._base = make_env([self.obj], self._env_options)
             self._env = policy_env(self._base, state_of(self._policy))
@@ -369,7 +369,7 @@ class Session:
         self._seen(frame, False)
 
     def _seen(self, frame: TensorDictBase, over: bool) -> None:
-        """Take in what the trial has led to."""
+        """Store the trial's new state."""
         assert self._base is not None
         task = cast("OpenArticulatedEnv", self._base.env)
         self._frame = self._predicted(frame)
@@ -388,7 +388,7 @@ class Session:
 
     @property
     def loaded(self) -> bool:
-        """Whether the simulator is there already."""
+        """Whether the simulator is loaded."""
         return self._base is not None
 
     def close(self) -> None:

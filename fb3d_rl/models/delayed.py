@@ -4,8 +4,8 @@ al., "Mesorasi", MICRO 2020).
     N points -> 20 % of them, balls of 0.2 m -> 25 % of those, balls of 0.4 m -> one vector for the cloud, and back by
     the three nearest, as in :mod:`fb3d_rl.models.pointnet2`, with narrower layers.
 
-PointNet++ runs its layers on every (centre, neighbour) pair, about 45 a centre. Here the layers see a point alone, in
-the cloud's frame. The one thing that needs a pair is the offset p_j - c_i, and as the last map before the maximum is
+PointNet++ runs its layers on every (centre, neighbour) pair, about 45 a centre. Here the layers run on single points,
+in the cloud's frame. The one thing that needs a pair is the offset p_j - c_i, and as the last map before the maximum is
 linear, its part of a centre leaves the maximum: max_j (W h_j + V (p_j - c_i)) = max_j (W h_j + V p_j) - V c_i.
 """
 
@@ -20,9 +20,9 @@ from torch.nn import functional
 
 from fb3d_rl.geometry import points as ops
 from fb3d_rl.models.dense import DenseLayer, DenseMLP, eager
-from fb3d_rl.models.pointnet2 import FeaturePropagation, GlobalAbstraction, Level, PointwiseNet, map_with_place
+from fb3d_rl.models.pointnet2 import FeaturePropagation, GlobalAbstraction, Level, PointwiseNet, map_with_position
 
-# Said once in every process, of what the tests hold here.
+# A warning of every process; tests cover what is used here.
 warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
 
 
@@ -54,12 +54,12 @@ class PooledAbstraction(nn.Module):
         """
         points = fine.flat(fine.points)
         first, *others = self.before
-        own = first.activate(map_with_place(first, features, points))
+        own = first.activate(map_with_position(first, features, points))
         for layer in others:
             own = layer(own)
         coarse, index, mask = fine.balls(self.ratio, self.radius, self.neighbors)
-        best = pooled_max(map_with_place(self.pooled, own, points), index, mask)
-        best = best - map_with_place(self.pooled, None, coarse.flat(coarse.points))
+        best = pooled_max(map_with_position(self.pooled, own, points), index, mask)
+        best = best - map_with_position(self.pooled, None, coarse.flat(coarse.points))
         return own, self.after(self.pooled.activate(best)), coarse
 
 

@@ -34,16 +34,14 @@ class DenseLayer(nn.Module):
         return self.activate(self.linear(rows))
 
     def fixed_norm(self) -> tuple[Tensor, Tensor]:
-        """Scale and shift [out] that batch norm is in evaluation mode."""
+        """Scale and shift [out] of batch norm in evaluation mode."""
         mean, variance = self._running()
         scale = self.norm.weight * (variance + self.norm.eps).rsqrt()
         return scale, self.norm.bias - mean * scale
 
     @torch.no_grad()
     def track(self, mean: Tensor, variance: Tensor, rows: int) -> None:
-        """Do what batch norm does in training beside normalizing: follow mean and biased variance [out] of
-        the rows.
-        """
+        """Update batch norm's running statistics by mean and biased variance [out] of the rows."""
         running_mean, running_variance = self._running()
         momentum = self.norm.momentum
         assert momentum is not None

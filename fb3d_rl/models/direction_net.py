@@ -20,8 +20,8 @@ class DirectionNet(CloudNetwork):
     """Score directions at contact points of a cloud.
 
     UMPNet (Xu, He and Song 2022) regresses how far an action in a given direction moves the part, from an image; here a
-    PointNet++ as in ArtFlowNet describes the point, and an MLP scores directions by that. So a cloud is looked at once,
-    however many directions are asked about.
+    PointNet++ as in ArtFlowNet gives each point a feature vector, and an MLP scores directions from it. So a cloud is
+    encoded once for any number of directions.
 
     Args: as of :class:`CloudNetwork`; ``part_mask_input`` has to be true.
 
@@ -38,10 +38,10 @@ class DirectionNet(CloudNetwork):
         """See the base class."""
         self.head = mlp(self.OUTPUTS + 3, 128, 128, 1)
 
-    def score(self, told: Tensor, directions: Tensor) -> Tensor:
-        """Scores [..., S] of directions [..., S, 3] at points that :meth:`per_point` told of [..., OUTPUTS]."""
-        told = told[..., None, :].expand(*directions.shape[:-1], -1)
-        scores: Tensor = self.head(torch.cat([told, directions.to(told.dtype)], dim=-1)).squeeze(-1)
+    def score(self, features: Tensor, directions: Tensor) -> Tensor:
+        """Scores [..., S] of directions [..., S, 3] at points with ``features`` [..., OUTPUTS] (:meth:`per_point`)."""
+        features = features[..., None, :].expand(*directions.shape[:-1], -1)
+        scores: Tensor = self.head(torch.cat([features, directions.to(features.dtype)], dim=-1)).squeeze(-1)
         return scores
 
     def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor, contact: Tensor, directions: Tensor) -> Tensor:
@@ -55,9 +55,9 @@ class SearchOptions:
 
     Attributes:
         samples: directions in a round; those of the first are uniform on the sphere.
-        rounds: how often is drawn.
-        elites: of each round's directions the best so many decide where the next are drawn.
-        seed: of all draws.
+        rounds: number of rounds.
+        elites: number of a round's best directions, around which the next round's are drawn.
+        seed: seed of all draws.
     """
 
     samples: int = 128
@@ -69,12 +69,12 @@ class SearchOptions:
 def best_direction(score: Callable[[Tensor], Tensor], options: SearchOptions, device: torch.device) -> Tensor:
     """The direction of the largest score, by the cross-entropy method (Rubinstein 1999).
 
-    Draws depend on the options alone: in each cloud and at each call the same.
+    Draws depend on the options only: they are the same in each cloud and at each call.
 
     Args:
         score: directions [B, S, 3], or [1, S, 3] for all clouds alike -> scores [B, S].
-        options: how it is searched.
-        device: where.
+        options: options of the search.
+        device: device of the directions.
 
     Returns:
         [B, 3], unit: the best of all directions that were scored.
@@ -104,7 +104,7 @@ def directions_at(
     net: DirectionNet, points: Tensor, valid: Tensor, part_mask: Tensor, contact: Tensor, options: SearchOptions
 ) -> Tensor:
     """The direction [B, 3] in which to pull at point number contact [B] of each cloud [B, N]."""
-    told = gather(net.per_point(points, valid, part_mask), contact)
+    features = gather(net.per_point(points, valid, part_mask), contact)
     return best_direction(
-        lambda directions: net.score(told, directions.expand(len(told), -1, -1)), options, told.device
+        lambda directions: net.score(features, directions.expand(len(features), -1, -1)), options, features.device
     )

@@ -1,4 +1,4 @@
-"""Encoders of a cloud as the gripper sees it: points around its tip and what it feels -> one vector."""
+"""Encoders of a cloud around the gripper's tip and of proprioception: points and a context vector -> one vector."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PointNet(nn.Module):
         inputs: features per point besides its position.
         context: entries of the vector that goes with the cloud (proprioception).
         outputs: entries of the result.
-        width: of the layers.
+        width: width of the layers.
 
     Shapes:
         points [B, N, 3] f32, m, relative to the suction tip; features [B, N, inputs] f32; valid [B, N] bool; context
@@ -65,25 +65,25 @@ class PointNet2Encoder(nn.Module):
 
 
 class AttentionPointNet(nn.Module):
-    """PointNet that, knowing the whole cloud, looks again and points at places.
+    """PointNet with attention: each head attends to one place in the cloud.
 
     A first MLP sees every point on its own; the maximum over the points is the cloud's vector, as in PointNet. A
-    second one sees each point beside that vector and scores it for ``heads`` heads; the softmax of a head's scores
+    second one gets each point with that vector and scores it for ``heads`` heads; the softmax of a head's scores
     over the cloud is its attention. What it attends to, as a mean position relative to the tip, mean flow and mean
-    features, is told to the policy exactly: a maximum over features alone would have to encode a place to millimetres.
+    features, is an input of the last MLP: a maximum over features could hardly encode a position to millimetres.
 
     Args:
         inputs: features per point besides its position.
         context: entries of the vector that goes with the cloud (proprioception).
         outputs: entries of the result.
-        heads: places that are looked at.
-        width: of the layers.
+        heads: number of attention heads.
+        width: width of the layers.
 
     Shapes: as of :class:`PointNet`.
     """
 
     SCALES = (0.03, 0.1, 0.3)
-    """Distances (m) from the tip that the network tells apart: touching, near, in front of the object."""
+    """Distances (m) from the tip that the network distinguishes: touching, near, in front of the object."""
 
     def __init__(self, inputs: int, context: int, outputs: int, width: int = 64, heads: int = 8) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""ArtFlowNet in dense operations of fixed shapes: for torch.export, and as the obvious way to compute the same."""
+"""ArtFlowNet in dense operations of fixed shapes: for torch.export, and as a plain reference implementation."""
 
 from __future__ import annotations
 

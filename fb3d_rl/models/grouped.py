@@ -35,7 +35,7 @@ class Block(NamedTuple):
     Attributes:
         here: the balls' sorted places.
         part: their slots.
-        balls: how many balls.
+        balls: number of balls.
         width: slots of each.
         full: no slot is a repeat.
     """
@@ -59,7 +59,7 @@ class Grouping:
         owner: [R] the sorted place of each slot's ball.
         weight: [R] f32: 1, or 0 on a slot that repeats a point only to fill a block.
         blocks: how the balls are cut up.
-        pairs: how many weights are 1.
+        pairs: number of weights that are 1.
         by_point: [R] slots sorted by their point.
         point_start: [P] where each point's slots begin in by_point.
     """
@@ -135,7 +135,7 @@ class _GroupedMax(torch.autograd.Function):
         """U [P, C1], V [Q, C1], then scale and shift of bn1; W2, bn2; W3, bn3 -> [Q, C3] and statistics."""
         pairs, weight = group.pairs, group.weight
         v = v[group.order]
-        # Layer 1: the statistics of U_j - V_i from sums over points and centres alone.
+        # Layer 1: the statistics of U_j - V_i from sums over points and centres only.
         ball_size = group.ball_size[:, None]
         point_size = group.sum_by_point(weight[:, None])
         near_points = functional.embedding_bag(group.source, u, group.ball_start, mode="sum", per_sample_weights=weight)
@@ -258,7 +258,7 @@ class _GroupedMax(torch.autograd.Function):
             torch.sum(d.view(block.balls, block.width, -1), 1, out=from_centre[block.here])
         d_w2 *= scale2[:, None]
 
-        # Layer 1, by sums over points and centres alone.
+        # Layer 1, by sums over points and centres only.
         from_point = group.sum_by_point(dz1)
         near_centres = group.sum_by_point(v, group.owner, weight)
         d_b1 = from_centre.sum(0)

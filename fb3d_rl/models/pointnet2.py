@@ -99,10 +99,10 @@ class Level:
         return fine.flat(index), fine.flat(share)
 
 
-def map_with_place(layer: DenseLayer, features: Tensor | None, points: Tensor) -> Tensor:
-    """The layer's linear map of (features [P, C], points [P, 3]) -> [P, out]; of the points alone without features.
+def map_with_position(layer: DenseLayer, features: Tensor | None, points: Tensor) -> Tensor:
+    """The layer's linear map of (features [P, C], points [P, 3]) -> [P, out]; features may be None.
 
-    The points' part is exact under autocast, too, which would round places to some 4 mm.
+    The points' part is computed in full precision: autocast would round positions to some 4 mm.
     """
     weight = layer.linear.weight
     with torch.autocast(points.device.type, enabled=False):
@@ -138,8 +138,8 @@ class SetAbstraction(nn.Module):
         # Inside the balls all is in the points' precision, under autocast, too.
         with torch.autocast(fine.points.device.type, enabled=False):
             own = None if features is None else features.to(fine.points.dtype)
-            of_points = map_with_place(first, own, fine.flat(fine.points))
-            of_centres = map_with_place(first, None, coarse.flat(coarse.points))
+            of_points = map_with_position(first, own, fine.flat(fine.points))
+            of_centres = map_with_position(first, None, coarse.flat(coarse.points))
             return grouped_max(of_points, of_centres, grouping, self.layers), coarse
 
 

@@ -12,7 +12,7 @@ from fb3d_rl.models.cloud_network import CloudNetwork
 class ScrewNet(CloudNetwork):
     """Predict how the part's joint moves, and the flow that follows from it.
 
-    The network is ArtFlowNet's but for what it says of a point: each point of the part votes for the joint's type, axis
+    The network is ArtFlowNet's with another output: each point of the part votes for the joint's type, axis
     and origin, and the mean of the votes counts. Votes for joints are those of Li et al. 2020 (category-level pose
     estimation of articulated objects).
 

@@ -12,10 +12,10 @@ def sample_cloud(
     """Draw exactly ``count`` of the points, without replacement and in random order; pad if there are fewer.
 
     Args:
-        points: [P, 3] world points of the object alone (gripper and ground removed), m.
+        points: [P, 3] world points of the object only (gripper and ground removed), m.
         links: [P] the link that each point lies on.
         count: N.
-        rng: the named generator that draws.
+        rng: the generator that draws.
 
     Returns:
         Points [N, 3] float32 and their links [N] int64; padding has the point 0 and the link -1.

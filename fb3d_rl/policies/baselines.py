@@ -15,7 +15,7 @@ from fb3d_rl.policies.policy import Policy
 
 
 class RandomPolicy(Policy):
-    """Actions that are uniform in [-1, 1] and depend on the trial's seed and the step alone: the lower bound.
+    """Actions that are uniform in [-1, 1] and depend on the trial's seed and the step only: the lower bound.
 
     Shapes: reads the trial's "seed" and "elapsed_steps" [E, 1]; writes "action" [E, 8].
     """
@@ -31,12 +31,12 @@ class RandomPolicy(Policy):
 
 
 class NormalFlow(TensorDictModuleBase):
-    """In place of a flow the outward normal of the visible surface, wherever the part to open is seen.
+    """The outward normal of the part's visible surface in place of a flow.
 
-    Normals are of the neighbourhood on the part (PCA), turned towards the camera as in the paper.
+    Normals are computed from neighbourhoods on the part (PCA) and turned towards the camera as in the paper.
 
     Args:
-        neighbors: points that make a neighbourhood.
+        neighbors: number of points of a neighbourhood.
 
     Shapes: reads the observation's points [E, N, 3], valid, part_mask [E, N] and camera_position [E, 3]; writes
     ("prediction", "flow") [E, N, 3], unit vectors on the part, 0 elsewhere.
@@ -59,15 +59,15 @@ class NormalFlow(TensorDictModuleBase):
 
 
 def random_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> RandomPolicy:
-    """What luck opens; limits and options say nothing to it."""
+    """Random actions; limits and options are not used."""
     return RandomPolicy()
 
 
 def normal_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> TensorDictSequential:
     """The flow policy fed with surface normals.
 
-    The paper's "Normal Direction" is given the point of largest true flow; this one chooses its contact point as any
-    flow policy does, so that it needs nothing privileged.
+    The paper's "Normal Direction" is given the point of largest true flow; this one chooses its contact point as
+    every flow policy does, so that it needs no ground truth.
     """
     options = options or FlowPolicyOptions()
     options.require_mask("policy=normal")

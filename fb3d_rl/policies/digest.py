@@ -1,4 +1,4 @@
-"""What makes a policy the policy that it is: its weights and its options, as one digest."""
+"""A digest that identifies a policy: of its classes, options and weights."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _take_tensor(digest: Any, value: Tensor) -> None:
 
 
 def _described(value: Any, hidden: list[nn.Module]) -> Any:
-    """``value`` in words that JSON knows; modules go to ``hidden``; what has no lasting form is named by its type."""
+    """``value`` as JSON; modules go to ``hidden``; values without a lasting form are named by their type."""
     if isinstance(value, nn.Module):
         hidden.append(value)
         return "module"

@@ -18,11 +18,11 @@ class Ensemble(Policy):
 
     "action" and what all members declare below "learner", such as a predicted discrepancy, are the members' means.
     ("learner", "variance") [E, 1] is the variance of each of the action's D entries across the members (divided by M,
-    as they are the whole ensemble), averaged over the entries: 1/(D M) sum_d sum_m (a_md - mean_d)^2. That is the
+    since they are the whole ensemble), averaged over the entries: 1/(D M) sum_d sum_m (a_md - mean_d)^2. That is the
     novelty of ThriftyDAgger and, since actions are normalised, EnsembleDAgger's variance in one number.
 
-    Every member reads the TensorDict as it came, never what another one wrote. A state below ("next", ...) that members
-    keep has to be one of the observation, such as the last actions: the first member writes it for all.
+    Every member reads the input, never an output of another one. A state below ("next", ...) has to depend on the
+    observation only, so that it is the same for all members: the first one writes it.
 
     Args:
         members: at least one learner; all of them declare the same keys.

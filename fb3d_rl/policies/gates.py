@@ -1,7 +1,7 @@
-"""The gates of interactive imitation: when the expert takes over from the learner and hands back.
+"""The gates of interactive imitation: when the expert takes over from the learner and when it hands back.
 
 Distances between actions are ||a_learner - a_expert|| over the D entries of normalised actions (the papers partly write
-its square). Where a number of the learner that a gate compares is not finite, the expert acts.
+its square). Where a number that a gate compares is not finite, the expert acts.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def budget_threshold(values: Tensor, budget: float) -> float:
     if not 0.0 <= budget <= 1.0:
         raise UserError(f"budget={budget} is no share; give a number from 0 to 1")
     if not values.numel():
-        raise ValueError("no steps to set a threshold by")
+        raise ValueError("there are no steps from which to set a threshold")
     above = math.floor(budget * values.numel() + 1e-9)  # 0.29 * 100 is below 29
     if above == values.numel():
         return -math.inf
@@ -134,15 +134,15 @@ class _HandoverGate(Gate):
         raise NotImplementedError
 
     def decided(self, frames: TensorDictBase) -> TensorDictBase:
-        """The steps in which the condition to take over was asked; the others have no part in the budget.
+        """The steps in which the condition to take over was evaluated; the budget is a share of these.
 
-        They include those in which the expert then took over: without them thresholds would sink from round to round.
+        Steps in which the expert then took over are among them: else thresholds would sink from round to round.
         """
         return frames[~frames["gate", self.name].squeeze(-1)]
 
 
 class LazyGate(_HandoverGate):
-    """LazyDAgger (Hoque et al., CASE 2021, Algorithm 1): SafeDAgger with hysteresis, for fewer changes of hands.
+    """LazyDAgger (Hoque et al., CASE 2021, Algorithm 1): SafeDAgger with hysteresis, for fewer changes of who acts.
 
     The expert takes over where the predicted distance exceeds beta_h, and hands back once the true one, which it sees
     while it acts, is below beta_r. The noise that the paper adds to the expert's actions is left out.
@@ -186,16 +186,16 @@ class LazyGate(_HandoverGate):
 
 
 class ThriftyGate(_HandoverGate):
-    """ThriftyDAgger (Hoque et al., CoRL 2021): the expert takes over where it is new or risky, within a budget.
+    """ThriftyDAgger (Hoque et al., CoRL 2021): the expert takes over in novel or risky states, within a budget.
 
-    New is an ensemble's variance above delta_h. Risky is in the paper a low probability of success, learned as a Q
-    function from sparse rewards. This is no such thing: here the predicted distance from the expert, above beta_h,
-    takes its place. The expert hands back once the true distance is below delta_r; the paper asks for a low risk too,
-    which with this stand-in would be the same question twice.
+    A state is novel if the ensemble's variance is above delta_h. The paper calls it risky if the probability of success
+    is low, which it learns as a Q function from sparse rewards. There is no Q function here: a state is risky if the
+    predicted distance from the expert is above beta_h. The expert hands back once the true distance is below delta_r;
+    the paper also asks for a low risk, which would here be the same condition twice.
 
     Args:
         delta_h: the largest variance at which the learner acts.
-        beta_h: the largest predicted distance at which it does.
+        beta_h: the largest predicted distance at which the learner acts.
         delta_r: distance below which the expert hands back.
 
     Raises:
@@ -217,9 +217,9 @@ class ThriftyGate(_HandoverGate):
     def tune(self, frames: TensorDictBase, budget: float) -> None:
         """Set all thresholds as the paper does.
 
-        delta_h and beta_h are the (1 - budget) quantiles of what the learner's steps showed, so that the expert takes
+        delta_h and beta_h are the (1 - budget) quantiles over the learner's steps, so that the expert takes
         over in ``budget`` to twice as many of them, as novelty and risk coincide or not. delta_r is the mean distance
-        over what the expert has labelled, which here is every step.
+        over the labelled steps, which here are all.
         """
         decided = self.decided(frames)
         self.delta_h.fill_(budget_threshold(decided[VARIANCE], budget))
@@ -251,7 +251,7 @@ def make_gate(name: str, **options: Any) -> Gate:
 
     Args:
         name: one of :data:`GATES`.
-        options: the gate's own; its defaults unless given.
+        options: options of this gate.
 
     Raises:
         UserError: there is no such gate, it has no such option or lacks one, or the option is out of range.
@@ -274,4 +274,4 @@ def _threshold(name: str, value: float) -> Tensor:
 
 
 def _exceeds(value: Tensor, threshold: Tensor) -> Tensor:
-    return ~(value <= threshold)  # true of what is not a number
+    return ~(value <= threshold)  # True for NaN

@@ -1,4 +1,4 @@
-"""Expert and learner at one gripper: in every step the expert says what it would do, and a gate says who acts."""
+"""Expert and learner with one gripper: the expert labels every step, and a gate decides who acts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from fb3d_rl.policies.policy import Policy, initial_state
 class Gate(nn.Module):
     """Decides in every step who acts: the expert or the learner.
 
-    A gate reads the observation, ("expert", "action"), ("learner", "action") and whatever else the learner wrote below
+    A gate reads the observation, ("expert", "action"), ("learner", "action") and what else the learner wrote below
     "learner". What changes from round to round (a share, a threshold) is a buffer, so that it reaches the workers with
     the weights. What changes within an episode is state: it travels in the TensorDict below "gate", as
     :meth:`initial_state` lays it out, and :meth:`forward` writes its next value below ("next", "gate").
@@ -30,11 +30,11 @@ class Gate(nn.Module):
     """What the gate reads besides its own state."""
 
     def tune(self, frames: TensorDictBase, budget: float) -> None:
-        """Set the thresholds, if a budget sets them, by what the last round showed.
+        """Set the thresholds from the last round's steps, if the gate has thresholds that a budget sets.
 
         Args:
-            frames: the steps [T] in which the gate decided, with what it reads, its state and the two actions. What
-                is below "learner" is best that of the learner as it is now.
+            frames: the steps [T] in which the gate decided, with what it reads, its state and the two actions.
+                Entries below "learner" should be those of the present learner.
             budget: share of the learner's steps in which the expert may take over, 0 to 1.
         """
 
@@ -50,8 +50,8 @@ class Gate(nn.Module):
 def uniform(tensordict: TensorDictBase, purpose: int, per_step: bool = True, count: int = 1) -> Tensor:
     """Random numbers [E, count] from 0 to below 1 for each environment, float64.
 
-    They depend on the trial's seed, the purpose and, if ``per_step``, the step alone, so that an episode is the same
-    whichever worker runs it.
+    They depend on the trial's seed, the purpose and, if ``per_step``, the step only, so that an episode does not depend
+    on the worker that runs it.
     """
     seeds, steps = tensordict["seed"].flatten().tolist(), tensordict["elapsed_steps"].flatten().tolist()
     draws = [
@@ -65,8 +65,8 @@ class BetaGate(Gate):
     """DAgger's mixture (Ross, Gordon, Bagnell 2011): the expert acts with probability beta.
 
     Args:
-        beta: the share of the expert; set anew for every round.
-        per_step: draw for every step; else once for an episode.
+        beta: the expert's share; each round sets its own.
+        per_step: whether to draw for every step, or once for an episode.
 
     Raises:
         UserError: beta is no share.
@@ -123,10 +123,10 @@ class EitherGate(Gate):
 
     def forward(self, tensordict: TensorDictBase) -> Tensor:
         """See :class:`Gate`."""
-        return torch.stack([gate(tensordict) for gate in self._each()]).any(0)  # all are asked: they may keep state
+        return torch.stack([gate(tensordict) for gate in self._each()]).any(0)  # no short cut: each may keep state
 
     def _each(self) -> Iterator[Gate]:
-        return (gate for gate in self.gates if isinstance(gate, Gate))  # all are; nn.ModuleList does not know
+        return (gate for gate in self.gates if isinstance(gate, Gate))  # for the type checker: all are
 
 
 class HumanGate(Gate):
@@ -147,15 +147,14 @@ class HumanGate(Gate):
 
 
 class InteractivePolicy(Policy):
-    """Expert and learner in one: ("expert", "action") is always the expert's label, "action" that of whoever acts.
+    """Expert and learner in one: ("expert", "action") is always the expert's label, "action" is executed.
 
     The expert keeps its own state while the learner acts, see :meth:`follow`.
 
     Args:
         expert: the flow policy with the true flow.
-        learner: reads what it declares, writes "action" and below "learner"; None while it is not trained yet, so that
-            the expert acts alone.
-        gate: who acts.
+        learner: writes "action" and entries below "learner"; None if there is none yet, so that only the expert acts.
+        gate: decides who acts.
 
     Raises:
         ValueError: the learner writes something else that the expert writes too, such as the flow policy's state.
@@ -201,12 +200,12 @@ class InteractivePolicy(Policy):
         return tensordict
 
     def follow(self, tensordict: TensorDictBase) -> None:
-        """Adapt the expert's state, in environments where the learner made the last step, to where the hand is by now.
+        """Adapt the expert's state, in environments where the learner made the last step, to the hand's present pose.
 
-        A learner cannot see which contact point the expert chose long ago, from elsewhere, nor whether it had begun its
-        approach. So a label depends on what can be seen: until it holds the part, the expert chooses the point and
-        whether to approach it again at every step. Steps of the learner are no lack of progress of the expert, and what
-        the learner misses or loses is none of the expert's own tries.
+        A learner cannot see which contact point the expert chose in an earlier step, nor whether it had begun its
+        approach. So that a label depends on the observation, the expert chooses the point, and whether to approach it,
+        again at every step until it holds the part. The learner's steps do not count as the expert's lack of progress,
+        and the learner's misses not as tries of the expert.
         """
         learner = tensordict["expert", "looks_on"]
         if not bool(learner.any()):

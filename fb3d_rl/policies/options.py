@@ -117,7 +117,7 @@ class FlowPolicyOptions:
         within="[0, inf)",
     )
     retry_distance: float = option(
-        0.08, "points nearer than this to a point tried in vain are not tried", "m", "[0, inf)"
+        0.08, "points nearer than this to a point that failed are not tried", "m", "[0, inf)"
     )
     nearby: float = option(
         0.1,
@@ -172,7 +172,7 @@ class PolicyOptions:
     name: str = option("expert", "a name of conf/policy/")
     mask: Literal["target", "none"] | None = option(
         None,
-        "which points the policy is told to act on: those of the part to open, or none, whatever has a flow (the "
+        "which points the policy acts on: those of the part to open, or none, whatever has a flow (the "
         'paper\'s "without mask"); null: none for a network that was trained without a mask, else target',
     )
     flow: FlowPolicyOptions = group(FlowPolicyOptions)
@@ -208,12 +208,12 @@ class LearnerOptions:
         "none", "the flow as a further input of each point; artflownet is its prediction"
     )
     points: int = option(
-        256, "the first so many points of a cloud are looked at; they come in random order", within="[16, inf)"
+        256, "number of points of a cloud that the learner reads; clouds are in random order", within="[16, inf)"
     )
     width: int = option(64, "of the network's layers", within="[4, inf)")
     history: int = option(3, "steps before the present one whose feelings it remembers", "control steps", "[0, inf)")
     chunk: int = option(1, "how far it plans ahead ...", "control steps", "[1, inf)")
-    execute: int = option(1, "... of which this many are executed before it looks again", "control steps", "[1, inf)")
+    execute: int = option(1, "... of which this many are executed before the next plan", "control steps", "[1, inf)")
     discrepancy: bool = False
 
     def __post_init__(self) -> None:

@@ -39,7 +39,7 @@ FACTS = {
     "started": "Started",
     "finished": "Finished",
 }
-"""Facts of a summary that pages tell, with their names."""
+"""Facts of a summary that pages show, with their names."""
 
 COPIED = (FACTS["command"],)
 """Facts that one may want to copy."""
@@ -48,7 +48,7 @@ COPIED = (FACTS["command"],)
 def terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
     """How to read the numbers that ``summaries`` have."""
     names = {name for numbers in summaries for name in tables.policies_of(numbers)}
-    told = {
+    has = {
         "Flow": any(map(tables.has_flow, summaries)),
         "Normalized distance": bool(names),
         "Success": bool(names),
@@ -56,11 +56,11 @@ def terms(summaries: Sequence[Mapping[str, Any]]) -> list[tuple[str, object]]:
         "What it took": any(tables.effort_of(numbers, tables.policies_of(numbers)) for numbers in summaries),
         "Expert": "expert" in names,
     }
-    return [(term, meaning) for term, meaning in READING if told.get(term, True)]
+    return [(term, meaning) for term, meaning in READING if has.get(term, True)]
 
 
 def effort(numbers: Mapping[str, Any], colors: Mapping[str, str]) -> list[Block]:
-    """What the trials of each policy took; nothing where no policy in ``colors`` has such numbers."""
+    """The effort of each policy's trials; nothing where no policy in ``colors`` has such numbers."""
     shown = (*tables.EFFORT, tables.DECISION)
     rows = []
     for name in tables.effort_of(numbers, list(colors)):

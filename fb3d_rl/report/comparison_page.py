@@ -190,7 +190,7 @@ def _told(found: Comparison) -> Facts:
 
 
 def _group_facts(group: Group) -> list[Block]:
-    """What was run, told once where all runs of the group agree."""
+    """The facts of the runs of each group; those on which they agree are listed once."""
     facts: list[tuple[str, object]] = [("Runs", ", ".join(group.names))]
     for key, label in FACTS.items():
         values = dict.fromkeys(str(run.summary[key]) for run in group.runs if run.summary.get(key) not in (None, ""))
@@ -225,7 +225,7 @@ def _trials(found: Comparison, colors: Mapping[str, str]) -> list[Block]:
 
 
 def _about(seed: int | None, row: TrialRow) -> tuple[object, ...]:
-    """What tells the trials of a run apart."""
+    """The entries that identify a trial of a run."""
     return seed, row.policy, row.split, row.category, row.object, row.link, row.seed
 
 

@@ -25,7 +25,7 @@ LEARNING = {
 """Panels of a run's learning curve: title -> key in the log -> what it is."""
 
 OVER_LABELS = tuple(key for title, keys in LEARNING.items() if title != "loss" for key in keys)
-"""What tells more over labels than over steps; the loss moves within a round."""
+"""Quantities that are drawn over labels, not steps; the loss is not, since it changes within a round."""
 
 
 @dataclass(frozen=True)
@@ -127,20 +127,20 @@ def training(logs: Sequence[tuple[str, str, Sequence[Mapping[str, Any]]]], skip:
     if several:
         head.append(Legend(list({name: color for name, color, _ in logs}.items())))
         if len(prefixes) > 1:
-            told = ", ".join(f"{prefix} {DASHES[i % len(DASHES)]}" for i, prefix in enumerate(prefixes))
-            head.append(Note(f"A line for each run; lines: {told}."))
+            dashes = ", ".join(f"{prefix} {DASHES[i % len(DASHES)]}" for i, prefix in enumerate(prefixes))
+            head.append(Note(f"A line for each run; lines: {dashes}."))
     return [*head, Grid(figures)]
 
 
 def once_a_round(log: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Keys of :func:`learning_curve` that are logged at most once a round: over steps they look the same."""
+    """Keys of :func:`learning_curve` that are logged at most once a round, and so not drawn over steps, too."""
     count = len(learning.rounds(log))
     keys = [key for titled in LEARNING.values() for key in titled]
     return [key for key in keys if count > 1 and sum(is_number(row.get(key)) for row in log) <= count]
 
 
 def learning_curve(log: Sequence[Mapping[str, Any]]) -> list[Block]:
-    """What a run of several rounds learned from how many labels; nothing for other runs."""
+    """The learning curve of a run of several rounds over labels; nothing for other runs."""
     if len(learning.rounds(log)) < 2:
         return []
     blocks = []

@@ -13,7 +13,7 @@ from fb3d_rl.report.page import Block, Choice, Figure, Grid, Legend, Titled
 from fb3d_rl.rollout.rows import NEVER_HELD, NEVER_TOUCHED, TrialRow
 
 _OTHER = "#7d8597"
-"""Colour of an end that no list names."""
+"""Colour of an unknown end."""
 
 _THROUGH = "rgba(128, 140, 158, 0.32)"
 _STAGE = "#98a2b3"
@@ -23,7 +23,7 @@ _SHORT = {
     NEVER_TOUCHED: "never touched",
     NOT_FAR: "not far enough",
 }
-"""Ends as the flow chart names them: the stage before tells the rest."""
+"""Names of ends in the flow chart, short because the stage before is shown."""
 
 _HEIGHT, _GAP = 270, 20
 """Height (pixels) of the flow chart, and of the gap between two nodes of it."""
@@ -37,7 +37,7 @@ def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> list[Block]:
     """
     charts = [(name, flow_chart(f"stages-{i}", rows)) for i, (name, rows) in enumerate(groups.items())]
     if len(charts) > 2:
-        # The expert's chart tells the least.
+        # The expert's chart is the least interesting.
         chosen = sorted(charts, key=lambda chart: all(row.policy == "expert" for row in groups[chart[0]]))
         return [*bars("ends", groups), Choice("stages of the trials of", chosen)]
     titled = [Titled(name, chart) for name, chart in charts]
@@ -45,7 +45,7 @@ def blocks(groups: Mapping[str, Sequence[TrialRow]]) -> list[Block]:
 
 
 def flow_chart(id_: str, rows: Sequence[TrialRow]) -> Figure:
-    """The stages of one policy's trials: each band is as wide as many trials went that way."""
+    """The stages of one policy's trials: the width of a band is its number of trials."""
     steps: Counter[tuple[str, str]] = Counter()
     for row in rows:
         passed = stages(row)
@@ -129,7 +129,7 @@ def bars(id_: str, groups: Mapping[str, Sequence[TrialRow]]) -> list[Block]:
             name=literal(name),
             y=labels,
             x=[count / len(rows) for count, rows in zip(counts, groups.values(), strict=True)],
-            # A number that is wider than its piece of the bar says nothing.
+            # No number where it is wider than its piece of the bar.
             text=[str(n) if n > 0.04 * len(rows) else "" for n, rows in zip(counts, groups.values(), strict=True)],
             textposition="inside",
             insidetextanchor="middle",

@@ -1,6 +1,6 @@
 """A page as plain data, and the file that the templates make of it.
 
-All HTML stands in the folder templates/, where every string is escaped; the blocks here hold text and numbers. A page
+All HTML is in the folder templates/, where every string is escaped; the blocks here hold text and numbers. A page
 loads nothing: style, scripts (the folder web/) and plotly.js stand inside, and a content security policy forbids every
 request.
 """
@@ -117,11 +117,11 @@ class Cell:
     Attributes:
         text: what it says; a line break in it stays one.
         small: small print below.
-        word: stands on the left, as words do.
+        word: whether it is aligned left, as words are.
         first: the first of a group of columns.
         color: of the policy or run that it names.
-        columns: how many columns it spans.
-        rows: how many rows it spans.
+        columns: number of columns that it spans.
+        rows: number of rows that it spans.
     """
 
     text: str
@@ -227,7 +227,7 @@ class Film:
 
 
 Filter: TypeAlias = tuple[str, str, Sequence[tuple[str, Mapping[str, int]]]]
-"""What a list chooses, the title of "all", and groups of choices: a field with how many trials have each value."""
+"""What a list chooses, the title of "all", and groups of choices: a field with the number of trials of each value."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ class Gallery:
     Attributes:
         trials: all trials.
         films: films of the trials with these places.
-        more: how many films the page has no room for.
+        more: number of films that are not on the page.
         filters: lists that choose which trials are shown.
     """
 
@@ -301,7 +301,7 @@ def write(path: Path, title: str, heading: str, header: Sequence[Block], section
         path: where.
         title: of the browser's window.
         heading: of the page.
-        header: what stands below the heading.
+        header: blocks below the heading.
         sections: what follows.
 
     Raises:

@@ -68,7 +68,7 @@ def _axes(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Where the arrows of these links' joints start and how they run, each [K, 3], m, world frame.
 
-    The arrow of a hinge stands out of its part at both ends, that of a slider starts at its part's middle.
+    The arrow of a hinge extends beyond its part at both ends, that of a slider starts at its part's middle.
     """
     starts, ways = [], []
     for link in links:

@@ -93,8 +93,8 @@ def _headline(numbers: Mapping[str, Any]) -> list[Block]:
         blocks.append(Cards([_card(m, numbers, prefix) for m in shown]))
     if not blocks:
         return []
-    told = tables.trainings(numbers)
-    return [*blocks, *[Note(told)] * bool(told), Facts(terms([numbers]))]
+    note = tables.trainings(numbers)
+    return [*blocks, *[Note(note)] * bool(note), Facts(terms([numbers]))]
 
 
 def _success_bars(numbers: Mapping[str, Any]) -> list[Block]:

@@ -1,1 +1,1 @@
-"""One object that stands in the world, and the one way in which it is observed."""
+"""One object in the world, and the one way to observe it."""

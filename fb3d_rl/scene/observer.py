@@ -1,4 +1,4 @@
-"""What is seen of an object: the cloud that policies get, what is true of it, and whether a part counts as visible."""
+"""Observation of an object: the cloud that policies get, its ground truth, and whether a part counts as visible."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MIN_VISIBLE = 20
 """A part with fewer points counts as not visible."""
 
 TRIES = 8
-"""Views that are drawn at most until one shows the part to open."""
+"""Largest number of views that are drawn until one shows the part to open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +43,10 @@ class Cloud:
         return visible(self.links, self.posed.obj.descendants(link))
 
     def with_truth(self, direction: Tensor) -> dict[str, Tensor]:
-        """The cloud and what is true of it.
+        """The cloud with its ground truth.
 
         Args:
-            direction: [J] float64, which joints move which way (:meth:`~fb3d_rl.scene.posed.Posed.direction`).
+            direction: [J] float64 of :meth:`~fb3d_rl.scene.posed.Posed.direction`: signs of the moving joints, else 0.
 
         Returns:
             "points" [N, 3] float32, "valid" [N] (False on padding), "part_mask" [N] (on what these joints move),
@@ -78,7 +78,7 @@ def observe(
     Args:
         posed: the object.
         poses: T_world_body [L + bodies, 4, 4] of its links and of the further bodies.
-        view: where the camera stands.
+        view: the camera's viewpoint.
         count: N.
         rng: draws which of the picture's points make the cloud.
         seen: points [P, 3] (m, world) of the object and their links [P], where another camera than the object's own
@@ -111,12 +111,12 @@ def find_view(
     """Draw views until one shows a part, :data:`TRIES` at most.
 
     Args:
-        posed: the object, alone in the world.
+        posed: the object.
         link: the part's link.
         state: joint state [J] (rad or m).
-        views: where views are drawn from.
+        views: the range of the views.
         rng: draws views and clouds.
-        count: points of the cloud in which the part has to be visible; None for all of the picture's.
+        count: points of the cloud in which the part has to be visible; None for all points of the picture.
 
     Returns:
         The view that was drawn last, and whether it shows the part.

@@ -1,4 +1,4 @@
-"""An object that stands in the world, with whatever is computed of it once."""
+"""An object in the world, with all that is computed from it once."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from fb3d_rl.kinematics.opening import link_corners, openable_links, opening_ran
 from fb3d_rl.kinematics.tree import KinematicTree
 
 FAR_BELOW = -1e3
-"""Height (m) of a body that is not there: nothing is hidden by it."""
+"""Height (m) at which a body hides nothing."""
 
 
 class Posed:
-    """An object of L links and J joints that stands on the ground before a depth camera.
+    """An object of L links and J joints on the ground before a depth camera.
 
     Args:
         obj: the object.
         camera: the camera's optics.
-        bodies: meshes of further rigid bodies that may stand in the camera's way, such as a gripper's.
+        bodies: meshes of further rigid bodies that may occlude it, such as a gripper's.
 
     Attributes:
         obj: the object.
         bodies: the further bodies.
-        tree: its kinematic tree.
+        tree: the object's kinematic tree.
         closed: joint state [J] (rad or m) in which everything is closed.
         opened: joint state [J] in which everything is open.
-        T_world_base: pose [4, 4] that stands it on the ground.
-        openable: indices of the links that one opens.
+        T_world_base: pose [4, 4] of the object on the ground.
+        openable: indices of the links that can be opened.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Posed:
 
     @property
     def visuals(self) -> list[Sequence[Mesh]]:
-        """What is seen of the links and of the further bodies, as meshes in their frames [L + bodies]."""
+        """Visible meshes of the links and of the further bodies, in their frames [L + bodies]."""
         return [*(link.visuals for link in self.obj.links), *self.bodies]
 
     def poses(self, state: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
@@ -88,7 +88,7 @@ class Posed:
     def direction(self, *links: int) -> Tensor:
         """Signs [J] float64 that open: +1 towards higher positions, -1 towards lower ones.
 
-        Those of the joints of ``links`` alone, the others 0; of all joints unless given. Endless ones turn forwards.
+        With ``links``, the signs of other joints are 0. Joints without limits open towards higher positions.
         """
         signs = np.where(self.opened < self.closed, -1.0, 1.0)
         if links:

@@ -22,7 +22,7 @@ class OptimizerOptions:
     schedule: Literal["constant", "one_cycle"] = option(
         "constant", "of the learning rate; one_cycle: up from lr / 25 in the first tenth, then down a cosine to 0"
     )
-    clip_norm: float | None = option(None, "largest norm of the gradient; null leaves it alone", within="(0, inf)")
+    clip_norm: float | None = option(None, "largest norm of the gradient; null: no limit", within="(0, inf)")
     log_every: int = option(10, "from one log row to the next", "steps", "[1, inf)")
     checkpoint_every: int | None = option(
         None, "from one checkpoint to the next; null: only at the end", "steps", "[1, inf)"

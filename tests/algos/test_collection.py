@@ -80,7 +80,7 @@ def collected(procedural_objects: dict[str, ArticulatedObject], monkeypatch: pyt
 
 
 def test_trials_without_a_label_end_with_what_to_change(collected: Any) -> None:
-    with pytest.raises(UserError, match=r"trials brought no label: .*env\.horizon.*algo\.oracle=false"):
+    with pytest.raises(UserError, match=r"trials gave no label: .*env\.horizon.*algo\.oracle=false"):
         collected(itertools.repeat("free"), 240)
 
 

@@ -75,7 +75,7 @@ def test_validation_objects_are_split_off_the_training_objects(
     assert "note" not in capsys.readouterr().out
     single = train_entries(replace(assets, categories=["Box"], train_count=1), tmp_path / "d", seed=1)
     assert len(single.train) == 1 and not single.validation
-    assert "nothing is validated" in capsys.readouterr().out
+    assert "no validation during training" in capsys.readouterr().out
 
 
 def test_an_object_is_named_by_its_folder_its_id_or_its_category(

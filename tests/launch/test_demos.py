@@ -1,4 +1,4 @@
-"""launch/demos.py: from recording to another format and back; what the user can mend is one sentence."""
+"""launch/demos.py: from recording to another format and back; an error that the user can fix is one sentence."""
 
 from __future__ import annotations
 
@@ -89,7 +89,10 @@ def test_what_is_wrong_is_one_sentence(
         (["record", out, "--root", tmp_path], "holds no object"),
         (["record", out, "--categories", "Car"], "Car"),
         (["record", recorded, *SMALL, "--trials", 1], "exists already"),
-        (["record", tmp_path / "few", *SMALL, "--trials", 1, "--successful", "--horizon", 1, "--workers", 1], "worth"),
+        (
+            ["record", tmp_path / "few", *SMALL, "--trials", 1, "--successful", "--horizon", 1, "--workers", 1],
+            "was kept",
+        ),
     ):
         sentence = say(demos, capsys, *arguments)
         assert any(word in sentence for word in words.split("|")), sentence

@@ -1,4 +1,4 @@
-"""The commands: what the user can mend ends in exit code 2 and one sentence, at once and without a trace.
+"""The commands: an error that the user can fix ends in exit code 2 and one sentence, at once and without a trace.
 
 To start Python and import costs seconds, so most of these commands are forked.
 """

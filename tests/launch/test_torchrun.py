@@ -69,4 +69,4 @@ def test_what_one_process_trains_refuses_several(tmp_path: Path) -> None:
     done = train(tmp_path, 2, "algo=bc", "experiment=smoke")
     assert done.returncode != 0 and "start it without torchrun" in done.stderr
     done = train(tmp_path, 2, *SMALL, "algo.batch_size=3")
-    assert done.returncode != 0 and "cannot be shared out" in done.stderr
+    assert done.returncode != 0 and "cannot be split equally" in done.stderr

@@ -214,7 +214,7 @@ def test_without_a_simulator_all_but_acting_works(oven: Session, monkeypatch: py
     monkeypatch.setitem(__import__("sys").modules, "fb3d_rl.env.task", None)
     oven.set_view(View(20.0, 30.0))
     oven.pick(*towards(oven, another_point(oven)))
-    with pytest.raises(UserError, match="simulator cannot be loaded.*mani-skill.*flow and contact points"):
+    with pytest.raises(UserError, match="simulator cannot be loaded.*mani-skill.*without running trials"):
         oven.step()
     assert oven.trial is None and oven.moment.contact is not None
 
@@ -265,9 +265,9 @@ def test_controls_do_what_they_say(server: Any, procedural_objects: dict[str, Ar
     session = session_of(procedural_objects["StorageFurniture"])
     page = Page(server, session)
     other = next(link for link in session.parts if link != session.link)
-    page._wish("part", lambda: session.set_part(other))
+    page._request("part", lambda: session.set_part(other))
     for opened in (0.1, 0.2, 0.3):
-        page._wish("joint", lambda opened=opened: page._set_joint(1, 100.0, 100.0 * opened))
+        page._request("joint", lambda opened=opened: page._set_joint(1, 100.0, 100.0 * opened))
     assert session.link != other, "nothing happens in the thread that wishes"
     page.attend()
     assert session.link == other and page._part_control.value == page._part_names[other]
@@ -276,21 +276,21 @@ def test_controls_do_what_they_say(server: Any, procedural_objects: dict[str, Ar
     slider, scale = page._joints[1]
     assert slider.value == pytest.approx(scale * session.moment.qpos[1], abs=0.1)
 
-    page._wish("a", lambda: page._act("Play"))
+    page._request("a", lambda: page._act("Play"))
     page.attend()
     page.attend()
     assert session.trial is not None and session.trial.steps == 2 and "phase" not in page._status.content
-    page._wish("b", lambda: page._act("Pause"))
+    page._request("b", lambda: page._act("Pause"))
     page.attend()
     page.attend(0.01)
     assert session.trial.steps == 2 and "paused in phase **travel**" in page._status.content
-    page._wish("c", lambda: page._act("Step"))
+    page._request("c", lambda: page._act("Step"))
     page.attend()
     assert session.trial.steps == 3
-    page._wish("d", lambda: page._act("Reset"))
+    page._request("d", lambda: page._act("Reset"))
     page.attend()
     assert session.trial is None and "Click the blue part" in page._status.content
-    page._wish("e", lambda: session.set_flow("predicted"))
+    page._request("e", lambda: session.set_flow("predicted"))
     page.attend()
     assert "checkpoint=PATH" in page._message.content, "what cannot be done is said on the page"
     session.close()

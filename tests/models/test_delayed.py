@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from fb3d_rl.models.delayed import map_with_place, pooled_max
+from fb3d_rl.models.delayed import map_with_position, pooled_max
 from fb3d_rl.models.dense import DenseLayer
 
 
@@ -33,7 +33,7 @@ def test_autocast_leaves_places_exact() -> None:
     """In bfloat16, 1.234 m is 1.2344 and 0.567 m 0.5664."""
     layer = DenseLayer(3, 8)
     points = torch.tensor([[1.234, 0.567, -0.321]])
-    exact = map_with_place(layer, None, points)
+    exact = map_with_position(layer, None, points)
     with torch.autocast("cpu", torch.bfloat16):
-        assert torch.equal(map_with_place(layer, None, points), exact)
+        assert torch.equal(map_with_position(layer, None, points), exact)
         assert not torch.equal(layer.linear(points).float(), exact)
