@@ -77,9 +77,10 @@ def generate(options: argparse.Namespace) -> None:
     """Write procedural objects."""
     from rich.progress import Progress
 
-    from fb3d_rl.assets import procedural
+    from fb3d_rl import procedural
+    from fb3d_rl.assets.catalog import expand
 
-    categories = procedural.expand(list(filter(None, options.categories.split(","))))
+    categories = expand(list(filter(None, options.categories.split(","))))
     procedural.check(categories, options.count, options.seed)
     with Progress() as bar:
         task = bar.add_task("objects", total=len(categories) * options.count)

@@ -27,9 +27,9 @@ from omegaconf import OmegaConf
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import generate
 from fb3d_rl.config import COMMANDS, EvaluateConfig, TrainConfig, ViewConfig, configured
 from fb3d_rl.config import schemas as typed_schemas
+from fb3d_rl.procedural import generate
 
 ROOT = Path(__file__).resolve().parents[1]
 Launch: TypeAlias = "Callable[..., CompletedProcess[str]]"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import torch
 
-from fb3d_rl.assets import procedural
+from fb3d_rl import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import (
     LOST_GEOMETRY,

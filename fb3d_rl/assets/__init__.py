@@ -1,1 +1,1 @@
-"""Articulated objects: PartNet-Mobility and UMPNet folders, procedural objects, splits."""
+"""Articulated objects: readers of PartNet-Mobility and UMPNet folders, catalogs, splits."""

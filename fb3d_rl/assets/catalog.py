@@ -10,11 +10,11 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from fb3d_rl.assets import procedural
+from fb3d_rl import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders, find_split_file
 from fb3d_rl.assets.partnet_mobility import listed, load_object, load_objects, load_usable, read_category
-from fb3d_rl.assets.splits import UMPNET_SPLIT, read_split, select_ids, split_of
+from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES, UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.errors import UserError
 
 log = logging.getLogger(__name__)
@@ -69,6 +69,22 @@ def warn_of_lost_geometry(objects: Iterable[ArticulatedObject]) -> None:
         )
 
 
+def expand(categories: Sequence[str]) -> list[str]:
+    """The names of families that words name: themselves, or one of these.
+
+    "all" is UMPNet's 21 categories, "train" its 11 training categories, "test" the 10 others; "mechanisms" is the kinds
+    of motion on bodies of any kind, :data:`fb3d_rl.procedural.MECHANISMS`. Look-alikes are in none of them: name them
+    singly.
+    """
+    groups = {
+        "all": [name for name in procedural.FAMILIES if name in CATEGORIES],
+        "train": [name for name in procedural.FAMILIES if name in TRAIN_CATEGORIES],
+        "test": [name for name in procedural.FAMILIES if name in CATEGORIES and name not in TRAIN_CATEGORIES],
+        "mechanisms": list(procedural.MECHANISMS),
+    }
+    return list(dict.fromkeys(name for word in categories for name in groups.get(word, [word])))
+
+
 def procedural_catalog(
     out: Path, categories: Sequence[str], count: int, held_out: int, seed: int, unseen: Sequence[str] = ()
 ) -> list[Entry]:
@@ -76,7 +92,7 @@ def procedural_catalog(
 
     Args:
         out: the folder.
-        categories: families to train on, see :func:`fb3d_rl.assets.procedural.expand`: each gives the split
+        categories: families to train on, see :func:`expand`: each gives the split
             "train_train" ``count`` objects and "train_test" ``held_out`` others; 0 for none.
         count: see above.
         held_out: see above.
@@ -86,7 +102,7 @@ def procedural_catalog(
     Raises:
         UserError: a category has no procedural family, or is to be trained on and unseen.
     """
-    categories, unseen = procedural.expand(categories), procedural.expand(unseen)
+    categories, unseen = expand(categories), expand(unseen)
     both = [name for name in unseen if name in categories]
     if both:
         raise UserError(

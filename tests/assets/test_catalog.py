@@ -11,9 +11,9 @@ import pytest
 
 from fb3d_rl.assets.catalog import folder_entries, lost_geometry, partnet_catalog, procedural_catalog
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import FAMILIES
 from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
 from fb3d_rl.errors import UserError
+from fb3d_rl.procedural import FAMILIES
 
 
 def contents(root: Path) -> dict[str, bytes]:

@@ -11,12 +11,12 @@ import torch
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import generate
 from fb3d_rl.benchmarks import environment as benchmark
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.contract import Key
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, Trial
+from fb3d_rl.procedural import generate
 from fb3d_rl.rollout.trials import schedule
 
 OPTIONS = EnvOptions(points=128, camera=CameraOptions(resolution=32), horizon=40)

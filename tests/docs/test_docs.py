@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import shapes
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
 from fb3d_rl.kinematics.opening import openable_links, opening_range
+from fb3d_rl.procedural import shapes
+from fb3d_rl.procedural.spec import ObjectSpec, Part, write_object
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

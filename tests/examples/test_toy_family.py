@@ -10,12 +10,12 @@ import torch
 
 from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import FAMILIES, ObjectSpec, Part, generate
-from fb3d_rl.assets.procedural.shapes import box, rectangle, wall
 from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.kinematics.opening import openable_links, opening_range
 from fb3d_rl.kinematics.validation import examine
+from fb3d_rl.procedural import FAMILIES, ObjectSpec, Part, generate
+from fb3d_rl.procedural.shapes import box, rectangle, wall
 from fb3d_rl.scene.posed import Posed
 
 # ------------------------------------------------------------------------------------------------------------- the toy

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.assets.procedural import FAMILIES, generate
 from fb3d_rl.kinematics.validation import Verdict, examine
+from fb3d_rl.procedural import FAMILIES, generate
 
 Broken = Callable[[str, str], Verdict]
 

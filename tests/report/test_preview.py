@@ -10,7 +10,7 @@ from PIL import Image
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import generate
+from fb3d_rl.procedural import generate
 from fb3d_rl.report.preview import AXIS, COLUMNS, SIZE, picture, write_sheet
 
 WIDTH, HEIGHT = SIZE

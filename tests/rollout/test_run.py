@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from fb3d_rl.assets import procedural
+from fb3d_rl import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions

@@ -15,7 +15,7 @@ from PIL import Image
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from fb3d_rl.assets import procedural
+from fb3d_rl import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.raycast import CameraOptions

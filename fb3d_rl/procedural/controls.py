@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural.bodies import (
+from fb3d_rl.procedural.bodies import (
     Half,
     Pose,
     draw_body,
@@ -20,8 +20,8 @@ from fb3d_rl.assets.procedural.bodies import (
     prism,
     quarter,
 )
-from fb3d_rl.assets.procedural.shapes import Piece, box, rod
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.shapes import Piece, box, rod
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 CLEAR = 0.007
 """Gap (m) between what moves and what does not, in a body about 2 m across."""

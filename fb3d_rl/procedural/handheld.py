@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, box, circle, housing, loft, rod, slab, wall
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.shapes import Piece, box, circle, housing, loft, rod, slab, wall
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def kettle(rng: np.random.Generator) -> ObjectSpec:

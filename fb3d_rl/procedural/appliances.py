@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.carcass import Carcass, Cell, CellKind, Column, build, scaled_size
-from fb3d_rl.assets.procedural.fronts import FrontStyle, Side, draw_front, draw_handle
-from fb3d_rl.assets.procedural.shapes import Piece, box, rod
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.carcass import Carcass, Cell, CellKind, Column, build, scaled_size
+from fb3d_rl.procedural.fronts import FrontStyle, Side, draw_front, draw_handle
+from fb3d_rl.procedural.shapes import Piece, box, rod
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 LEFT_HINGED = 0.3
 """Share of single doors of refrigerators and safes that are hinged on the left; most are made for right hands."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.bodies import any_yaw, holed, pitch, ring, yaw
-from fb3d_rl.assets.procedural.controls import CLEAR
-from fb3d_rl.assets.procedural.shapes import Piece, box, housing, rod
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.bodies import any_yaw, holed, pitch, ring, yaw
+from fb3d_rl.procedural.controls import CLEAR
+from fb3d_rl.procedural.shapes import Piece, box, housing, rod
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def telescopic_handle(rng: np.random.Generator) -> ObjectSpec:

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fb3d_rl.assets.procedural import (
+from fb3d_rl.errors import UserError
+from fb3d_rl.procedural import (
     appliances,
     caps,
     controls,
@@ -31,9 +32,7 @@ from fb3d_rl.assets.procedural import (
     sliding,
     turning,
 )
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part, write_object
-from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
-from fb3d_rl.errors import UserError
+from fb3d_rl.procedural.spec import ObjectSpec, Part, write_object
 
 __all__ = [
     "FAMILIES",
@@ -41,7 +40,6 @@ __all__ = [
     "MECHANISMS",
     "ObjectSpec",
     "Part",
-    "expand",
     "generate",
     "object_id",
     "sample",
@@ -128,21 +126,6 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     return spec.normalised()
 
 
-def expand(categories: Sequence[str]) -> list[str]:
-    """The names of families that words name: themselves, or one of these.
-
-    "all" is UMPNet's 21 categories, "train" its 11 training categories, "test" the 10 others; "mechanisms" is the kinds
-    of motion on bodies of any kind, `MECHANISMS`. Look-alikes are in none of them: name them singly.
-    """
-    groups = {
-        "all": [name for name in FAMILIES if name in CATEGORIES],
-        "train": [name for name in FAMILIES if name in TRAIN_CATEGORIES],
-        "test": [name for name in FAMILIES if name in CATEGORIES and name not in TRAIN_CATEGORIES],
-        "mechanisms": list(MECHANISMS),
-    }
-    return list(dict.fromkeys(name for word in categories for name in groups.get(word, [word])))
-
-
 def check(categories: Sequence[str], count: int, seed: int) -> None:
     """Refuse what cannot be generated before anything is written.
 
@@ -169,7 +152,7 @@ def generate(
 
     Args:
         out: Folder of object folders; made if it is not there.
-        categories: Keys of `FAMILIES`; see `expand` for words that name many.
+        categories: Keys of `FAMILIES`; see `fb3d_rl.assets.catalog.expand` for words that name many.
         count: Objects per category.
         seed: Seed of the whole set, at least 0.
         progress: Called after each object.

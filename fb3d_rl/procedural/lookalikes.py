@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.frames import frame
-from fb3d_rl.assets.procedural.fronts import FrontStyle, HandleStyle, Side, hinged_door, swing_room
-from fb3d_rl.assets.procedural.spec import ObjectSpec
+from fb3d_rl.procedural.frames import frame
+from fb3d_rl.procedural.fronts import FrontStyle, HandleStyle, Side, hinged_door, swing_room
+from fb3d_rl.procedural.spec import ObjectSpec
 
 VARIANTS = 4
 """Doors of one group: hinged left or right, and each pulled or pushed."""

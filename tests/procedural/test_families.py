@@ -18,9 +18,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from fb3d_rl.assets.catalog import expand
 from fb3d_rl.assets.partnet_mobility import load_object
-from fb3d_rl.assets.procedural import FAMILIES, LOOKALIKES, MECHANISMS, expand, generate, object_id, sample
-from fb3d_rl.assets.procedural.spec import write_object
 from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES
 from fb3d_rl.camera.raycast import RaycastCamera
 from fb3d_rl.camera.views import View
@@ -28,6 +27,8 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
 from fb3d_rl.kinematics.opening import MIN_TRAVEL, openable_links, opening_range, travel
 from fb3d_rl.kinematics.tree import KinematicTree
+from fb3d_rl.procedural import FAMILIES, LOOKALIKES, MECHANISMS, generate, object_id, sample
+from fb3d_rl.procedural.spec import write_object
 
 PER_FAMILY = 4
 SEED = 3
@@ -160,7 +161,7 @@ def test_a_failed_object_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.Mo
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("fb3d_rl.assets.procedural.spec._obj", fail)
+    monkeypatch.setattr("fb3d_rl.procedural.spec._obj", fail)
     with pytest.raises(OSError, match="disk full"):
         generate(tmp_path, ["Box"], 1, 0)
     assert list(tmp_path.iterdir()) == []

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.fronts import (
+from fb3d_rl.procedural.fronts import (
     FrontStyle,
     Side,
     draw_handle,
@@ -14,8 +14,8 @@ from fb3d_rl.assets.procedural.fronts import (
     panel,
     swing_room,
 )
-from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, housing, rod
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, housing, rod
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def frame(name: str, x: Range, y: Range, z: Range, bar: float, sill: bool, head: float | None = None) -> list[Piece]:

@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.fronts import FrontStyle, Side, drawer, hinged_door, swing_room
-from fb3d_rl.assets.procedural.shapes import Piece, Range, box, rod
-from fb3d_rl.assets.procedural.spec import Part
+from fb3d_rl.procedural.fronts import FrontStyle, Side, drawer, hinged_door, swing_room
+from fb3d_rl.procedural.shapes import Piece, Range, box, rod
+from fb3d_rl.procedural.spec import Part
 
 CellKind = Literal["drawer", "left", "right", "bottom", "top", "double", "open", "controls"]
 """A cell's front: drawer, door hinged on one side, pair of doors, nothing, or a fixed panel with knobs."""

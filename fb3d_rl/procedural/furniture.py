@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.carcass import Carcass, Cell, CellKind, Column, build, scaled_size
-from fb3d_rl.assets.procedural.fronts import draw_front
-from fb3d_rl.assets.procedural.shapes import box
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.carcass import Carcass, Cell, CellKind, Column, build, scaled_size
+from fb3d_rl.procedural.fronts import draw_front
+from fb3d_rl.procedural.shapes import box
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def _suited(rng: np.random.Generator, cell: Cell, width: float, height: float) -> Cell:

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, rod
-from fb3d_rl.assets.procedural.spec import Part
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, rod
+from fb3d_rl.procedural.spec import Part
 
 Side = Literal["left", "right", "bottom", "top"]
 OPPOSITE: dict[Side, Side] = {"left": "right", "right": "left", "bottom": "top", "top": "bottom"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural.bodies import (
+from fb3d_rl.procedural.bodies import (
     Half,
     Pose,
     any_yaw,
@@ -15,9 +15,9 @@ from fb3d_rl.assets.procedural.bodies import (
     prism,
     quarter,
 )
-from fb3d_rl.assets.procedural.controls import CLEAR
-from fb3d_rl.assets.procedural.shapes import Piece, Range, box, rod
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.controls import CLEAR
+from fb3d_rl.procedural.shapes import Piece, Range, box, rod
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def folding_blade(rng: np.random.Generator) -> ObjectSpec:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural.shapes import Piece, Range, Vector, box, circle, loft, rod, slab
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, circle, loft, rod, slab
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 Half = tuple[float, float]
 """Half sizes of a rectangle along x and y, m."""

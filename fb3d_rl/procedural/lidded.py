@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.assets.procedural.shapes import Piece, Range, box, circle, loft, rectangle, rod, slab, wall
-from fb3d_rl.assets.procedural.spec import ObjectSpec, Part
+from fb3d_rl.procedural.shapes import Piece, Range, box, circle, loft, rectangle, rod, slab, wall
+from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
 def kitchen_pot(rng: np.random.Generator) -> ObjectSpec:

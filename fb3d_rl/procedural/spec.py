@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.procedural.shapes import Piece, Vector
+from fb3d_rl.procedural.shapes import Piece, Vector
 
 DECIMALS = 6
 """Written text is rounded to this, so that the last bits of a machine's sine do not change the bytes."""
