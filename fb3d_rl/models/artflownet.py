@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
 import numpy as np
 import torch
@@ -218,9 +218,28 @@ def reads_mask(net: nn.Module) -> bool:
     return bool(getattr(net, "part_mask_input", True))
 
 
-def artflownet_module(net: nn.Module) -> TensorDictModule:
+def artflownet_module(net: nn.Module, proposals: bool = False) -> TensorDictModule:
     """Read the observation's points, valid and, if the network was trained with it, part_mask; write ("prediction",
     "flow"), what the network answers; of several hypotheses the most probable.
+
+    Args:
+        net: the network.
+        proposals: whether all hypotheses are written, too: ("prediction", "flows") [B, K, N, 3] and ("prediction",
+            "log_probabilities") [B, K, N].
     """
     keys = [("observation", key) for key in ("points", "valid", *(["part_mask"] if reads_mask(net) else []))]
-    return TensorDictModule(net, in_keys=keys, out_keys=[("prediction", "flow")])
+    names = ["flow", "flows", "log_probabilities"] if proposals else ["flow"]
+    module = _Proposals(cast("ArtFlowNet", net)) if proposals else net
+    return TensorDictModule(module, in_keys=keys, out_keys=[("prediction", name) for name in names])
+
+
+class _Proposals(nn.Module):
+    """An :class:`ArtFlowNet` that answers with its most probable flow and all its hypotheses."""
+
+    def __init__(self, net: ArtFlowNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        found = self.net.propose(points, valid, part_mask)
+        return self.net.most_probable(found, valid, part_mask), found.flows, found.log_probabilities

@@ -95,9 +95,10 @@ def pull(state: FlowState, seen: Observed, control: Control) -> Commanded:
     """Along the flow at the tip. What turns the last flow into this one also turns the hand."""
     flow = flow_at_tip(state, seen, control)
     goes_on = seen.phase == PULL
-    turned = rotate(state.standoff, alignment(state.pull, flow))
+    turns = torch.where(dot(state.pull, flow) < 0, -flow, flow)  # a flow that reverses does not turn the hand
+    turned = rotate(state.standoff, alignment(state.pull, turns))
     state = state.changed(goes_on, standoff=turned).updated(pull=flow)
-    return state, seen.sense * control.options.pull_speed * flow
+    return state, seen.sense * control.options.pull_speed * flow if seen.pull is None else seen.pull
 
 
 def retreat(state: FlowState, seen: Observed, control: Control) -> Commanded:

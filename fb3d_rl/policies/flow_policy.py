@@ -35,11 +35,9 @@ from dataclasses import fields
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
+from torch import Tensor
 
 from fb3d_rl.geometry.transforms import alignment
-from fb3d_rl.models.artflownet import artflownet_module, reads_mask
 from fb3d_rl.policies.commands import above_ground, command
 from fb3d_rl.policies.contact import Contact, best_candidate
 from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
@@ -60,16 +58,21 @@ class FlowPolicy(Policy):
             FlowBot3D.
         limits: what an action means.
         options: speeds, gains, distances and times.
+        pull_key: where the tip's velocity [E, 3] (m/s) in a pull is read; unless given, it follows from the flow.
 
     Shapes: reads the contract's "observation" group and the flow [E, N, 3]; writes ``action`` [E, 8] and the next
     step's state (:class:`~fb3d_rl.policies.flow_state.FlowState`) under ``("next", "policy")``.
     """
 
     def __init__(
-        self, flow_key: tuple[str, str], limits: VelocityLimits, options: FlowPolicyOptions | None = None
+        self,
+        flow_key: tuple[str, str],
+        limits: VelocityLimits,
+        options: FlowPolicyOptions | None = None,
+        pull_key: tuple[str, str] | None = None,
     ) -> None:
         super().__init__()
-        self.flow_key = flow_key
+        self.flow_key, self.pull_key = flow_key, pull_key
         self.limits = limits
         self.options = options or FlowPolicyOptions()
         self._control = Control(self.options, limits)
@@ -77,6 +80,7 @@ class FlowPolicy(Policy):
         observed = ("points", "valid", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
         self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
         self.in_keys += [MASK] if self.options.mask == "target" else []
+        self.in_keys += [] if pull_key is None else [pull_key]
         self.in_keys += [("policy", key) for key in state]
         self.out_keys = ["action"] + [("next", "policy", key) for key in state]
 
@@ -102,6 +106,7 @@ class FlowPolicy(Policy):
             part=None if self.options.mask == "none" else obs["part_mask"],
             flow=tensordict[self.flow_key],
             camera=obs["camera_position"],
+            pull=None if self.pull_key is None else tensordict[self.pull_key].double(),
         )
         state, velocity = command(advance(state, seen, self._control), seen, self._control)
         axis = above_ground(state.standoff, seen.tip, self.options.clearance)
@@ -144,16 +149,3 @@ class FlowPolicy(Policy):
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:
     """The flow policy fed with the ground-truth flow: the upper bound, and the oracle of DAgger."""
     return FlowPolicy(("privileged", "flow"), limits, options)
-
-
-def artflownet_policy(
-    net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
-) -> TensorDictModule:
-    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form.
-
-    Raises:
-        UserError: the network reads the mask that the options keep from the policy.
-    """
-    if options is not None and reads_mask(net):
-        options.require_mask("a network that was trained with the mask")
-    return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))

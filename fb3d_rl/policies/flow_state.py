@@ -139,6 +139,7 @@ class Observed:
         part: [E, N] bool, on the part to open; None if the policy is not shown it.
         flow: [E, N, 3].
         camera: [E, 3] m.
+        pull: [E, 3] velocity of the tip in a pull, m/s; None if it follows from the flow.
     """
 
     phase: Tensor
@@ -152,6 +153,7 @@ class Observed:
     part: Tensor | None
     flow: Tensor
     camera: Tensor
+    pull: Tensor | None
 
     def __getitem__(self, rows: Tensor) -> Observed:
         """Some of the environments, by a mask [E] bool."""

@@ -75,6 +75,35 @@ class ContactOptions:
 
 
 @dataclass(frozen=True)
+class TouchOptions:
+    """What the flow policy learns from its pulls, see fb3d_rl.policies.touch."""
+
+    speed: float = option(0.2, "of a pull of which it is not known that the part follows", "m/s", "(0, inf)")
+    follows: float = option(0.03, "way of the held point after which the part follows", "m", "[0, inf)")
+    limit: float = option(0.03, "stretch of the suction's spring at which a slow pull has met a limit", "m", "(0, inf)")
+    resistance: float = option(
+        0.15, "share of its speed by which the hand lags behind where a fast pull becomes slow", within="[0, 1]"
+    )
+    stiffness: float = option(0.85, "how much the hand lags for each metre of the spring's stretch", "1/s", "(0, inf)")
+    damping: float = option(0.19, "... and for each m/s at which it grows", within="(0, inf)")
+    ease: float = option(0.1, "speed at which the hand backs off while it presses on what it pulls", "m/s", "[0, inf)")
+    follow: float = option(
+        2.0, "rate at which the tip makes up for the spring's stretch across the pull", "1/s", "[0, inf)"
+    )
+    yields: float = option(6.0, "rate at which it does so in all directions where it met resistance", "1/s", "[0, inf)")
+    spacing: float = option(0.015, "way of the held point between two measurements", "m", "(0, inf)")
+    precision: float = option(0.0002, "variance of a measured direction times the way that it is of", "m", "(0, inf)")
+    deviation: float = option(0.35, "standard deviation of the network's direction", within="(0, inf)")
+    turn_deviation: float = option(1.0, "standard deviation of the network's turn", "rad/m", "(0, inf)")
+    certainty: float = option(0.8, "probability of the network's sense of the motion", within="(0, 1)")
+    at_once: float = option(0.05, "a limit that is met within this way is met at once", "m", "[0, inf)")
+    against_at_once: float = option(4.0, "log-odds against a direction in which a limit is met at once")
+    against: float = option(1.5, "log-odds against a direction in which a limit is met later")
+    convincing: float = option(0.1, "way of the part that counts 1 for its direction in log-odds", "m", "(0, inf)")
+    keeps: float = option(5.0, "log-odds for the direction of a pull that goes on")
+
+
+@dataclass(frozen=True)
 class FlowPolicyOptions:
     """How the flow policy moves; ``mask`` and ``contact`` are set from their own keys."""
 
@@ -152,6 +181,8 @@ class FlowPolicyOptions:
         "m",
         "[0, inf)",
     )
+    learn: bool = option(True, "whether a predicted flow is corrected by what is felt while pulling")
+    touch: TouchOptions = group(TouchOptions)
     mask: Literal["target", "none"] = "target"
     contact: ContactOptions = ContactOptions()
 

@@ -12,12 +12,13 @@ from fb3d_rl.models.direction_net import DirectionNet
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.direction_policy import direction_policy
 from fb3d_rl.policies.ensemble import Ensemble
-from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
+from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.gates import make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 from fb3d_rl.policies.learner import Learner, LearnerOptions
 from fb3d_rl.policies.policy import initial_state
+from fb3d_rl.policies.touch import artflownet_policy
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 
@@ -35,7 +36,7 @@ def policies() -> dict[str, tuple[TensorDictModuleBase, set[str]]]:
     expert = expert_policy(LIMITS)
     return {
         "expert": (expert, {"policy"}),
-        "artflownet": (artflownet_policy(ArtFlowNet(neighbors=8, generator=generator()), LIMITS), {"policy"}),
+        "artflownet": (artflownet_policy(ArtFlowNet(neighbors=8, generator=generator()), LIMITS), {"policy", "touch"}),
         "normal": (normal_policy(LIMITS), {"policy"}),
         "direction": (direction_policy(DirectionNet(generator=generator()), LIMITS), {"policy"}),
         "random": (RandomPolicy(), set()),

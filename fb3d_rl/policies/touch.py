@@ -1,0 +1,287 @@
+"""What the pull teaches: the joint's screw and the sense that opens, fused with what the network sees.
+
+A part that a joint holds moves by one screw, a twist (v, omega) that stays the same in the world while it opens. The
+network's flow is a guess of it; the way of the tip while it pulls measures it. Both are Gaussians over the six numbers
+of the twist, so that the estimate and its uncertainty follow from a sum of information matrices (a linear
+least-squares problem), as in the equilibrium-point control of Jain and Kemp (2009, 2010), who fit a circle to the tip.
+
+Which sense opens can rarely be measured at once; evidence is gathered for each direction: a pull that moved the part
+speaks for its direction, one that met a limit against it. The candidates are the network's flows in either sense; the
+best one is what the network believes, what agrees with the measured screw and with the evidence.
+
+A new pull is slow, so that the spring of the suction cannot tear at a limit, until the part has moved a few
+centimetres. Where the tip falls behind its command the pull is slow again; where it stands still, that is a limit, and
+the pull goes on in the best sense that is left, without letting go.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import fields
+
+import torch
+from tensordict import TensorClass, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+
+from fb3d_rl.geometry.points import squared_distances
+from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion
+from fb3d_rl.geometry.transforms import dot, length, normalize, skew
+from fb3d_rl.models.artflownet import artflownet_module, reads_mask
+from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.flow_state import PULL
+from fb3d_rl.policies.hand import VelocityLimits, hand_axis
+from fb3d_rl.policies.options import FlowPolicyOptions
+from fb3d_rl.policies.policy import Policy
+
+FLOW, PROPOSALS, VELOCITY = ("prediction", "flow"), ("prediction", "flows"), ("prediction", "pull_velocity")
+LOG_PROBABILITIES = ("prediction", "log_probabilities")
+
+
+class TouchState(TensorClass):
+    """What the pulls of an episode have taught, in E environments.
+
+    Twists are (v, omega): v [m/m] of the body's point at ``origin`` and omega [rad/m], per metre of the way of that
+    point.
+
+    Attributes:
+        origin: [E, 3] where the first pull began, m.
+        information: [E, 6, 6] precision of the measured twist; 0 before the first measurement.
+        moment: [E, 6] precision times the measured twist, whose sense is that of the first pull.
+        evidence: [E, 6] what the pulls say of a direction: the log-odds of a twist is the product with it.
+        asked: [E, 3] velocity of the tip that the pull of the last step asked for, m/s; 0 if there was none.
+        commanded: [E, 3] velocity of the hand's slides that the last action commanded, m/s.
+        tip: [E, 3] the suction tip in the last step, m.
+        stretch: [E, 3] how far the tip is ahead of the held point, m.
+        measured: [E, 3] where the held point was when the way was measured last, m.
+        moved: [E, 1] how far the held point has moved since the hold or the last change of sense, m.
+        tested: [E, 1] how far it has moved since the pull has become slow, m.
+    """
+
+    origin: Tensor
+    information: Tensor
+    moment: Tensor
+    evidence: Tensor
+    asked: Tensor
+    commanded: Tensor
+    tip: Tensor
+    stretch: Tensor
+    measured: Tensor
+    moved: Tensor
+    tested: Tensor
+
+    @classmethod
+    def initial(cls, batch: Sequence[int]) -> TouchState:
+        """Nothing was felt: all zeros."""
+        sizes = {"information": (6, 6), "moment": (6,), "evidence": (6,), "moved": (1,), "tested": (1,)}
+        names = [field.name for field in fields(cls)]
+        state = {name: torch.zeros(*batch, *sizes.get(name, (3,))) for name in names}
+        return cls(**state, batch_size=torch.Size(batch))
+
+
+class TouchPolicy(Policy):
+    """A flow policy whose flow is corrected by what its pulls have taught.
+
+    Shapes: reads what :class:`~fb3d_rl.policies.flow_policy.FlowPolicy` reads, the slides' velocities ("observation",
+    "qvel") and, if the network proposes K flows, ("prediction", "flows") [E, K, N, 3] and ("prediction",
+    "log_probabilities") [E, K, N]. Overwrites ("prediction", "flow"); writes what the flow policy writes, the tip's
+    velocity in a pull ("prediction", "pull_velocity") [E, 3] (m/s), and the next step's :class:`TouchState` under
+    ("next", "touch").
+
+    Args:
+        limits: what an action means.
+        options: speeds and thresholds.
+        proposals: whether the network proposes several flows.
+    """
+
+    def __init__(self, limits: VelocityLimits, options: FlowPolicyOptions, proposals: bool) -> None:
+        super().__init__()
+        self.limits, self.options, self.proposals = limits, options, proposals
+        self.flow_policy = FlowPolicy(FLOW, limits, options, VELOCITY)
+        state = [("touch", field.name) for field in fields(TouchState)]
+        self.in_keys = [key for key in self.flow_policy.in_keys if key != VELOCITY] + [("observation", "qvel"), *state]
+        self.in_keys += [PROPOSALS, LOG_PROBABILITIES] if proposals else []
+        self.out_keys = [FLOW, VELOCITY, *self.flow_policy.out_keys, *(("next", *key) for key in state)]
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        """The flow policy's state and {"touch": ...}: nothing was felt."""
+        touch = TensorDict({"touch": TouchState.initial(batch).to_tensordict()}, batch_size=batch)
+        return self.flow_policy.initial_state(batch).update(touch)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the corrected flow, the action and the next state."""
+        obs, state = tensordict["observation"], TouchState.from_tensordict(tensordict["touch"])
+        state = state.apply(lambda x: x.double())
+        assert isinstance(state, TouchState)
+        tip, held = obs["tool_pose"][:, :3].double(), obs["attached"]
+        pulled = (tensordict["policy", "phase"] == PULL) & (state.asked != 0).any(-1, keepdim=True)
+        state, blocked, halted = self._feel(state, tip, obs["qvel"][:, :3].double(), held, pulled)
+        asked = velocity = torch.zeros_like(tip)
+        if bool(held.any()) or bool(state.information.any()) or bool(state.evidence.any()):
+            tensordict[FLOW], twist, direction = self._believe(tensordict, state, tip, held, pulled & ~blocked)
+            asked, velocity = self._pull(obs, state, held, halted, twist, direction)
+        tensordict[VELOCITY] = velocity
+        tensordict = self.flow_policy(tensordict)
+        state.asked, state.tip = asked, tip
+        state.commanded = self.limits.linear * tensordict["action"][:, :3].double()
+        tensordict["next", "touch"] = state.apply(lambda x: x.float()).to_tensordict()
+        return tensordict
+
+    def _pull(
+        self,
+        obs: TensorDictBase,
+        state: TouchState,
+        held: Tensor,
+        halted: Tensor,
+        twist: Tensor,
+        direction: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """The velocity of the part that is asked for and that of the tip which is to bring it about, [E, 3] m/s."""
+        o, options = self.options.touch, self.options
+        speed = torch.where(state.tested > o.follows, options.pull_speed, o.speed)
+        ahead = torch.linalg.cross(options.lead * self.limits.period * speed * twist[:, 3:], direction)
+        asked = torch.where(held, speed * direction, 0.0)
+        across = state.stretch - dot(state.stretch, direction) * direction
+        yields = torch.where(halted, o.yields * state.stretch, o.follow * across)
+        pressed = obs["contact_force"] > options.force
+        off = torch.where(pressed, o.ease, 0.0) * hand_axis(obs["tool_pose"]).double()
+        return asked, speed * normalize(direction + ahead) - yields + off
+
+    def _feel(
+        self, state: TouchState, tip: Tensor, slides: Tensor, held: Tensor, pulled: Tensor
+    ) -> tuple[TouchState, Tensor, Tensor]:
+        """The state after the last step; where the pull met a limit, and where it met that or resistance [E, 1]."""
+        o, period = self.options.touch, self.limits.period
+        state = state.clone(recurse=False)
+        goes_on, begins, lost = pulled & held, held & ~pulled, pulled & ~held
+        lag = state.commanded - slides  # by which the drives yield to the spring
+        direction, wanted = normalize(state.asked), length(state.asked)
+        before, strained = state.tip - state.stretch, dot(state.stretch, direction)
+        # The spring's force is stiffness * stretch + damping * its rate; the drives' is in proportion to the lag.
+        decay = math.exp(-period * o.stiffness / o.damping)
+        state.stretch = torch.where(goes_on, decay * state.stretch + (1 - decay) / o.stiffness * lag, 0.0)
+        point = tip - state.stretch
+        way = dot(point - before, direction)
+        state.moved = torch.where(goes_on, state.moved + way, state.moved)
+        state.tested = torch.where(goes_on, state.tested + way, state.tested)
+
+        state.origin = torch.where(begins & ~state.origin.any(-1, keepdim=True), tip, state.origin)
+        state.measured = torch.where(begins, tip, state.measured)
+        step = point - state.measured
+        measures = goes_on & (length(step) > o.spacing) & (dot(step, direction) > 0.3 * length(step))
+        measures &= length(step) > length(state.stretch)
+        rows = _velocity_at(point - 0.5 * step - state.origin)  # [E, 3, 6]
+        weight = torch.where(measures, length(step) / o.precision, 0.0)[..., None]
+        unit = (rows.mT @ normalize(step)[..., None]).squeeze(-1)
+        unit = torch.where((unit * state.moment).sum(-1, keepdim=True) < 0, -unit, unit)
+        state.information = state.information + weight * (rows.mT @ rows)
+        state.moment = state.moment + weight.squeeze(-1) * unit
+        state.measured = torch.where(measures, point, state.measured)
+
+        ahead = dot(state.stretch, direction)
+        slow = wanted < 0.9 * self.options.pull_speed
+        blocked = goes_on & slow & (ahead > o.limit) & (state.tested < 0.5 * ahead)
+        resisted = goes_on & ~slow & (dot(lag, direction) > o.resistance * wanted)
+        limit = blocked | (lost & (strained > 0.5 * o.limit))
+        against = torch.where(limit, torch.where(state.moved < o.at_once, o.against_at_once, o.against), 0.0)
+        gained = torch.where(blocked | lost, (state.moved / o.convincing).clamp(0.0, 2.0), 0.0)
+        along = (_velocity_at(point - state.origin).mT @ direction[..., None]).squeeze(-1)
+        # Neither sense moves the part: it cannot move along this direction.
+        neither = blocked & (state.moved < o.at_once) & ((along * state.evidence).sum(-1, keepdim=True) > o.against)
+        stiff = torch.where(neither, o.at_once / o.precision, 0.0)[..., None]
+        state.information = state.information + stiff * along[..., None] * along[:, None]
+        state.evidence = state.evidence + (gained - against) * along
+        state.measured = torch.where(blocked, point, state.measured)
+        state.moved = torch.where(blocked | lost | begins, 0.0, state.moved)
+        state.tested = torch.where(blocked | lost | begins | resisted, 0.0, state.tested)
+        return state, blocked, blocked | resisted
+
+    def _believe(
+        self, tensordict: TensorDictBase, state: TouchState, tip: Tensor, held: Tensor, goes_on: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The flow [E, N, 3] by all that is known, its twist [E, 6] and the direction of the pull [E, 3]."""
+        o, obs = self.options.touch, tensordict["observation"]
+        valid, sense = obs["valid"], obs["goal_sense"].double()
+        part = obs["part_mask"] & valid if self.options.mask == "target" else None
+        flows = tensordict[PROPOSALS] if self.proposals else tensordict[FLOW][:, None]  # [E, K, N, 3]
+        count = flows.shape[1]
+        place = torch.where(held, tip, state.origin)
+        twists = torch.stack(
+            [self._twist(obs["points"], flow, valid, part, place, state.origin) for flow in flows.unbind(1)], 1
+        )
+        prior = tip.new_zeros(len(tip), count)
+        if self.proposals:
+            about = valid if part is None else part
+            logs = tensordict[LOG_PROBABILITIES].double().masked_fill(~about[:, None], 0.0)
+            prior = (logs.sum(2) / about.sum(1).clamp_min(1)[:, None]).log_softmax(1)
+        certain = torch.tensor(o.certainty, dtype=prior.dtype)
+        prior = torch.cat([prior + certain.log(), prior + (1 - certain).log()], 1)
+        candidates = torch.cat([twists, -twists], 1) * sense[..., None]  # of the way that is pulled
+
+        rows = _velocity_at(place - state.origin)
+        trust = rows.mT @ rows / o.deviation**2  # [E, 6, 6] of the network
+        trust[:, 3:, 3:] += torch.eye(3, dtype=trust.dtype) / o.turn_deviation**2
+        guess = candidates @ trust
+        aligned = torch.where((candidates * state.moment[:, None]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
+        right = aligned * state.moment[:, None] + guess
+        total = state.information + trust
+        found = torch.linalg.solve(total[:, None], right[..., None]).squeeze(-1)  # [E, 2K, 6]
+        fits = 0.5 * ((right * found).sum(-1) - (candidates * guess).sum(-1))
+        ways = found @ rows.mT  # [E, 2K, 3]
+        found = found / length(ways).clamp_min(1e-3)
+        ways = normalize(ways)
+        keeps = torch.where(goes_on, o.keeps * (ways @ normalize(state.asked)[..., None]).squeeze(-1), 0.0)
+        best = (prior + fits + (found * state.evidence[:, None]).sum(-1) + keeps).argmax(1)
+        row = torch.arange(len(tip))
+        twist, direction = found[row, best], ways[row, best]
+
+        measured = state.information.flatten(1).any(1)[:, None, None]
+        flipped = torch.where(best < count, 1.0, -1.0).to(flows)
+        flow = flipped[:, None, None] * flows[row, best % count]
+        field = twist[:, None, :3] + torch.linalg.cross(
+            twist[:, None, 3:].expand(-1, valid.shape[1], -1), obs["points"].double() - state.origin[:, None]
+        )
+        moving = flow.norm(dim=-1) > 0.05 if part is None else part
+        field = (sense[..., None] * field).masked_fill(~(moving & valid)[..., None], 0.0)
+        field = field / field.norm(dim=-1).amax(1)[:, None, None].clamp_min(1e-9)
+        flow = torch.where(measured, field.to(flow), flow)
+        return flow, twist, direction
+
+    def _twist(
+        self, points: Tensor, flow: Tensor, valid: Tensor, part: Tensor | None, place: Tensor, origin: Tensor
+    ) -> Tensor:
+        """The twist [E, 6] at ``origin`` [E, 3] that fits a flow, of unit speed there."""
+        if part is None:
+            squared = squared_distances(points, place.to(points)[:, None]).squeeze(-1)
+            weight = local_weight(flow, squared).masked_fill(~valid, 0.0)
+        else:
+            weight = part.to(points.dtype)
+        velocity, omega = (x.double() for x in rigid_motion(points, flow, weight, origin.to(points), 1e-4))
+        largest = flow.norm(dim=-1).amax(1, keepdim=True).double()
+        speed = torch.maximum(length(velocity), 0.2 * largest).clamp_min(1e-9)
+        return torch.cat([velocity, omega], -1) / speed
+
+
+def _velocity_at(arm: Tensor) -> Tensor:
+    """The matrix [E, 3, 6] that takes a twist to the velocity of the body's point ``arm`` [E, 3] (m) off the origin."""
+    eye = torch.eye(3, dtype=arm.dtype).expand(len(arm), 3, 3)
+    return torch.cat([eye, -skew(arm)], -1)
+
+
+def artflownet_policy(
+    net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
+) -> TensorDictModule:
+    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form.
+
+    Raises:
+        UserError: the network reads the mask that the options keep from the policy.
+    """
+    if options is not None and reads_mask(net):
+        options.require_mask("a network that was trained with the mask")
+    options = options or FlowPolicyOptions()
+    if not options.learn:
+        return TensorDictSequential(artflownet_module(net), FlowPolicy(FLOW, limits, options))
+    proposals = getattr(net, "hypotheses", 1) > 1
+    return TensorDictSequential(artflownet_module(net, proposals), TouchPolicy(limits, options, proposals))
