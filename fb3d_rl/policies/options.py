@@ -76,22 +76,29 @@ class ContactOptions:
 
 @dataclass(frozen=True)
 class TouchOptions:
-    """What the flow policy learns from its pulls, see fb3d_rl.policies.touch."""
+    """What the flow policy learns from its pulls, see fb3d_rl.policies.touch; "part" is the held point of the part."""
 
-    speed: float = option(0.2, "of a pull of which it is not known that the part follows", "m/s", "(0, inf)")
-    follows: float = option(0.03, "way of the held point after which the part follows", "m", "[0, inf)")
-    limit: float = option(0.03, "stretch of the suction's spring at which a slow pull has met a limit", "m", "(0, inf)")
+    speed: float = option(0.2, "of the tip in a slow pull, until it is known that the part follows", "m/s", "(0, inf)")
+    free_after: float = option(0.03, "way of the part after which a slow pull becomes fast", "m", "[0, inf)")
+    limit_stretch: float = option(
+        0.03,
+        "stretch of the suction's spring at which a slow pull has met a limit, unless the part moved",
+        "m",
+        "(0, inf)",
+    )
+    still: float = option(
+        0.35, "share of its speed below which a hand that presses on the part stands still", within="[0, 1]"
+    )
     resistance: float = option(
         0.15, "share of its speed by which the hand lags behind where a fast pull becomes slow", within="[0, 1]"
     )
-    stiffness: float = option(0.85, "how much the hand lags for each metre of the spring's stretch", "1/s", "(0, inf)")
-    damping: float = option(0.19, "... and for each m/s at which it grows", within="(0, inf)")
-    ease: float = option(0.1, "speed at which the hand backs off while it presses on what it pulls", "m/s", "[0, inf)")
-    follow: float = option(
-        2.0, "rate at which the tip makes up for the spring's stretch across the pull", "1/s", "[0, inf)"
-    )
-    yields: float = option(6.0, "rate at which it does so in all directions where it met resistance", "1/s", "[0, inf)")
-    spacing: float = option(0.015, "way of the held point between two measurements", "m", "(0, inf)")
+    # Measured with the gripper and the suction of the simulated task: the lag is the force over the drives' damping.
+    stiffness: float = option(0.85, "lag of the hand for each metre of the spring's stretch", "1/s", "(0, inf)")
+    damping: float = option(0.19, "lag of the hand for each m/s at which the stretch grows", within="(0, inf)")
+    ease_speed: float = option(0.1, "speed at which the hand backs off while it presses on the part", "m/s", "[0, inf)")
+    slack_gain: float = option(2.0, "rate at which the tip gives way to stretch across the pull", "1/s", "[0, inf)")
+    yield_gain: float = option(6.0, "rate at which it gives way to all stretch at resistance", "1/s", "[0, inf)")
+    spacing: float = option(0.015, "way of the part between two measurements of its direction", "m", "(0, inf)")
     precision: float = option(0.0002, "variance of a measured direction times the way that it is of", "m", "(0, inf)")
     deviation: float = option(0.35, "standard deviation of the network's direction", within="(0, inf)")
     turn_deviation: float = option(1.0, "standard deviation of the network's turn", "rad/m", "(0, inf)")
@@ -99,7 +106,9 @@ class TouchOptions:
     at_once: float = option(0.05, "a limit that is met within this way is met at once", "m", "[0, inf)")
     against_at_once: float = option(4.0, "log-odds against a direction in which a limit is met at once")
     against: float = option(1.5, "log-odds against a direction in which a limit is met later")
-    convincing: float = option(0.1, "way of the part that counts 1 for its direction in log-odds", "m", "(0, inf)")
+    convincing: float = option(
+        0.15, "way of the part that counts 1 for its direction in log-odds, at most 4", "m", "(0, inf)"
+    )
     keeps: float = option(5.0, "log-odds for the direction of a pull that goes on")
 
 

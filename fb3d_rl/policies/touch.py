@@ -56,6 +56,7 @@ class TouchState(TensorClass):
         stretch: [E, 3] how far the tip is ahead of the held point, m.
         measured: [E, 3] where the held point was when the way was measured last, m.
         moved: [E, 1] how far the held point has moved since the hold or the last change of sense, m.
+        limits: [E, 1] how many limits it has met since then, 0 or 1.
         tested: [E, 1] how far it has moved since the pull has become slow, m.
     """
 
@@ -69,12 +70,13 @@ class TouchState(TensorClass):
     stretch: Tensor
     measured: Tensor
     moved: Tensor
+    limits: Tensor
     tested: Tensor
 
     @classmethod
     def initial(cls, batch: Sequence[int]) -> TouchState:
         """Nothing was felt: all zeros."""
-        sizes = {"information": (6, 6), "moment": (6,), "evidence": (6,), "moved": (1,), "tested": (1,)}
+        sizes = {"information": (6, 6), "moment": (6,), "evidence": (6,), "moved": (1,), "limits": (1,), "tested": (1,)}
         names = [field.name for field in fields(cls)]
         state = {name: torch.zeros(*batch, *sizes.get(name, (3,))) for name in names}
         return cls(**state, batch_size=torch.Size(batch))
@@ -115,17 +117,19 @@ class TouchPolicy(Policy):
         obs, state = tensordict["observation"], TouchState.from_tensordict(tensordict["touch"])
         state = state.apply(lambda x: x.double())
         assert isinstance(state, TouchState)
-        tip, held = obs["tool_pose"][:, :3].double(), obs["attached"]
+        held = obs["attached"]
         pulled = (tensordict["policy", "phase"] == PULL) & (state.asked != 0).any(-1, keepdim=True)
-        state, blocked, halted = self._feel(state, tip, obs["qvel"][:, :3].double(), held, pulled)
-        asked = velocity = torch.zeros_like(tip)
+        state, blocked, halted = self._feel(state, obs, held, pulled)
+        asked = velocity = torch.zeros_like(state.tip)
         if bool(held.any()) or bool(state.information.any()) or bool(state.evidence.any()):
-            tensordict[FLOW], twist, direction = self._believe(tensordict, state, tip, held, pulled & ~blocked)
+            tensordict[FLOW], twist, direction = self._believe(tensordict, state, held, pulled, blocked)
+            turns = blocked & (dot(direction, normalize(state.asked)) < 0.5)
+            self._conclude(state, turns)
+            state.moved, state.limits = (torch.where(turns, 0.0, x) for x in (state.moved, state.limits))
             asked, velocity = self._pull(obs, state, held, halted, twist, direction)
         tensordict[VELOCITY] = velocity
         tensordict = self.flow_policy(tensordict)
-        state.asked, state.tip = asked, tip
-        state.commanded = self.limits.linear * tensordict["action"][:, :3].double()
+        state.asked, state.commanded = asked, self.limits.linear * tensordict["action"][:, :3].double()
         tensordict["next", "touch"] = state.apply(lambda x: x.float()).to_tensordict()
         return tensordict
 
@@ -140,38 +144,67 @@ class TouchPolicy(Policy):
     ) -> tuple[Tensor, Tensor]:
         """The velocity of the part that is asked for and that of the tip which is to bring it about, [E, 3] m/s."""
         o, options = self.options.touch, self.options
-        speed = torch.where(state.tested > o.follows, options.pull_speed, o.speed)
+        speed = torch.where(state.tested > o.free_after, options.pull_speed, o.speed)
+        speed = torch.where(state.limits > 0, 0.25 * o.speed, speed)  # the flow policy will let go
         ahead = torch.linalg.cross(options.lead * self.limits.period * speed * twist[:, 3:], direction)
         asked = torch.where(held, speed * direction, 0.0)
         across = state.stretch - dot(state.stretch, direction) * direction
-        yields = torch.where(halted, o.yields * state.stretch, o.follow * across)
+        yields = torch.where(halted, o.yield_gain * state.stretch, o.slack_gain * across)
         pressed = obs["contact_force"] > options.force
-        off = torch.where(pressed, o.ease, 0.0) * hand_axis(obs["tool_pose"]).double()
+        off = (
+            torch.where(pressed & (speed < options.pull_speed), o.ease_speed, 0.0)
+            * hand_axis(obs["tool_pose"]).double()
+        )
         return asked, speed * normalize(direction + ahead) - yields + off
 
     def _feel(
-        self, state: TouchState, tip: Tensor, slides: Tensor, held: Tensor, pulled: Tensor
+        self, state: TouchState, obs: TensorDictBase, held: Tensor, pulled: Tensor
     ) -> tuple[TouchState, Tensor, Tensor]:
         """The state after the last step; where the pull met a limit, and where it met that or resistance [E, 1]."""
         o, period = self.options.touch, self.limits.period
         state = state.clone(recurse=False)
+        tip, slides = obs["tool_pose"][:, :3].double(), obs["qvel"][:, :3].double()
         goes_on, begins, lost = pulled & held, held & ~pulled, pulled & ~held
-        lag = state.commanded - slides  # by which the drives yield to the spring
+        pressed = obs["contact_force"] > self.options.force  # then the drives yield to more than the spring
         direction, wanted = normalize(state.asked), length(state.asked)
-        before, strained = state.tip - state.stretch, dot(state.stretch, direction)
+        before, strained, way = state.tip - state.stretch, dot(state.stretch, direction), length(tip - state.tip)
         # The spring's force is stiffness * stretch + damping * its rate; the drives' is in proportion to the lag.
+        lag = state.commanded - slides
         decay = math.exp(-period * o.stiffness / o.damping)
-        state.stretch = torch.where(goes_on, decay * state.stretch + (1 - decay) / o.stiffness * lag, 0.0)
+        stretch = torch.where(pressed, state.stretch, decay * state.stretch + (1 - decay) / o.stiffness * lag)
+        state.tip, state.stretch = tip, torch.where(goes_on, stretch, 0.0)
         point = tip - state.stretch
-        way = dot(point - before, direction)
-        state.moved = torch.where(goes_on, state.moved + way, state.moved)
-        state.tested = torch.where(goes_on, state.tested + way, state.tested)
-
+        moved = torch.where(goes_on, dot(point - before, direction), 0.0)
+        state.moved, state.tested = state.moved + moved, state.tested + moved
         state.origin = torch.where(begins & ~state.origin.any(-1, keepdim=True), tip, state.origin)
         state.measured = torch.where(begins, tip, state.measured)
-        step = point - state.measured
-        measures = goes_on & (length(step) > o.spacing) & (dot(step, direction) > 0.3 * length(step))
-        measures &= length(step) > length(state.stretch)
+        self._measure(state, point, direction, goes_on)
+
+        ahead, slow = dot(state.stretch, direction), wanted < 0.9 * self.options.pull_speed
+        stops = (ahead > o.limit_stretch) & (state.tested < 0.5 * ahead)
+        stops |= pressed & (way < o.still * wanted * period) & (state.tested < o.at_once)
+        blocked = goes_on & slow & stops & (state.limits == 0)
+        resisted = goes_on & ~slow & ~pressed & (dot(lag, direction) > o.resistance * wanted)
+        limit = blocked | (lost & (strained > 0.5 * o.limit_stretch))
+        against = torch.where(state.moved < o.at_once, o.against_at_once, o.against)
+        along = (_velocity_at(point - state.origin).mT @ direction[..., None]).squeeze(-1)
+        # Neither sense moves the part: it cannot move along this direction.
+        neither = blocked & (state.moved < o.at_once) & ((along * state.evidence).sum(-1, keepdim=True) > o.against)
+        stiff = torch.where(neither, o.at_once / o.precision, 0.0)[..., None]
+        state.information = state.information + stiff * along[..., None] * along[:, None]
+        state.evidence = state.evidence - torch.where(limit, against, 0.0) * along
+        self._conclude(state, lost)
+        state.measured = torch.where(blocked, point, state.measured)
+        state.limits = torch.where(begins, 0.0, state.limits + blocked)
+        state.moved = torch.where(lost | begins, 0.0, state.moved)
+        state.tested = torch.where(blocked | lost | begins | resisted, 0.0, state.tested)
+        return state, blocked, blocked | resisted
+
+    def _measure(self, state: TouchState, point: Tensor, direction: Tensor, goes_on: Tensor) -> None:
+        """Measure the way of the held ``point`` [E, 3], if it has gone far enough for that."""
+        o, step = self.options.touch, point - state.measured
+        far = length(step) > length(state.stretch).clamp_min(o.spacing)
+        measures = goes_on & far & (dot(step, direction) > 0.3 * length(step))
         rows = _velocity_at(point - 0.5 * step - state.origin)  # [E, 3, 6]
         weight = torch.where(measures, length(step) / o.precision, 0.0)[..., None]
         unit = (rows.mT @ normalize(step)[..., None]).squeeze(-1)
@@ -180,29 +213,20 @@ class TouchPolicy(Policy):
         state.moment = state.moment + weight.squeeze(-1) * unit
         state.measured = torch.where(measures, point, state.measured)
 
-        ahead = dot(state.stretch, direction)
-        slow = wanted < 0.9 * self.options.pull_speed
-        blocked = goes_on & slow & (ahead > o.limit) & (state.tested < 0.5 * ahead)
-        resisted = goes_on & ~slow & (dot(lag, direction) > o.resistance * wanted)
-        limit = blocked | (lost & (strained > 0.5 * o.limit))
-        against = torch.where(limit, torch.where(state.moved < o.at_once, o.against_at_once, o.against), 0.0)
-        gained = torch.where(blocked | lost, (state.moved / o.convincing).clamp(0.0, 2.0), 0.0)
-        along = (_velocity_at(point - state.origin).mT @ direction[..., None]).squeeze(-1)
-        # Neither sense moves the part: it cannot move along this direction.
-        neither = blocked & (state.moved < o.at_once) & ((along * state.evidence).sum(-1, keepdim=True) > o.against)
-        stiff = torch.where(neither, o.at_once / o.precision, 0.0)[..., None]
-        state.information = state.information + stiff * along[..., None] * along[:, None]
-        state.evidence = state.evidence + (gained - against) * along
-        state.measured = torch.where(blocked, point, state.measured)
-        state.moved = torch.where(blocked | lost | begins, 0.0, state.moved)
-        state.tested = torch.where(blocked | lost | begins | resisted, 0.0, state.tested)
-        return state, blocked, blocked | resisted
+    def _conclude(self, state: TouchState, where: Tensor) -> None:
+        """Count the way that the part has gone for its direction, as the pull in it has ended [E, 1]."""
+        gained = torch.where(where, self._gained(state), 0.0)
+        along = _velocity_at(state.tip - state.stretch - state.origin).mT @ normalize(state.asked)[..., None]
+        state.evidence = state.evidence + gained * along.squeeze(-1)
+
+    def _gained(self, state: TouchState) -> Tensor:
+        return (state.moved / self.options.touch.convincing).clamp(0.0, 4.0)
 
     def _believe(
-        self, tensordict: TensorDictBase, state: TouchState, tip: Tensor, held: Tensor, goes_on: Tensor
+        self, tensordict: TensorDictBase, state: TouchState, held: Tensor, pulled: Tensor, blocked: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The flow [E, N, 3] by all that is known, its twist [E, 6] and the direction of the pull [E, 3]."""
-        o, obs = self.options.touch, tensordict["observation"]
+        o, obs, tip = self.options.touch, tensordict["observation"], state.tip
         valid, sense = obs["valid"], obs["goal_sense"].double()
         part = obs["part_mask"] & valid if self.options.mask == "target" else None
         flows = tensordict[PROPOSALS] if self.proposals else tensordict[FLOW][:, None]  # [E, K, N, 3]
@@ -232,7 +256,8 @@ class TouchPolicy(Policy):
         ways = found @ rows.mT  # [E, 2K, 3]
         found = found / length(ways).clamp_min(1e-3)
         ways = normalize(ways)
-        keeps = torch.where(goes_on, o.keeps * (ways @ normalize(state.asked)[..., None]).squeeze(-1), 0.0)
+        for_it = self._gained(state) + torch.where(blocked, 0.0, o.keeps)
+        keeps = torch.where(pulled & held, for_it * (ways @ normalize(state.asked)[..., None]).squeeze(-1), 0.0)
         best = (prior + fits + (found * state.evidence[:, None]).sum(-1) + keeps).argmax(1)
         row = torch.arange(len(tip))
         twist, direction = found[row, best], ways[row, best]
