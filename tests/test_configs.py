@@ -122,6 +122,21 @@ def test_what_the_command_line_says_goes_before_an_experiment() -> None:
     assert compose("evaluate", "experiment=smoke", "collector=process").collector.backend == "process"
 
 
+@pytest.mark.parametrize("algo", sorted(path.stem for path in (CONF / "algo").glob("*.yaml")))
+def test_smoke_bounds_the_steps_of_every_algorithm(algo: str) -> None:
+    from fb3d_rl.algos import dagger, flow_network
+
+    def steps(*overrides: str) -> int:
+        cfg = compose("train", "experiment=smoke", f"algo={algo}", *overrides)
+        if hasattr(cfg.algo, "rounds"):
+            return sum(dagger.fit_options(cfg.algo, cfg.data, 0, number).steps for number in range(cfg.algo.rounds))
+        return flow_network.fit_options(cfg).steps
+
+    cfg = compose("train", "experiment=smoke", f"algo={algo}")
+    assert steps() <= (75 if hasattr(cfg.algo, "rounds") else 20)
+    assert steps("algo.epochs=1e6") == steps("algo.epochs=20") < steps("algo.epochs=21", "data.max_epochs=null")
+
+
 def declared(kind: type) -> set[tuple[type, str]]:
     """The keys of options and of the groups in them, each with the class that declares it."""
     own = {(owner(kind, item.name), item.name) for item, _, _ in options.keys(kind)}

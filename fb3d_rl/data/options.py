@@ -68,5 +68,14 @@ class DataOptions(SampleOptions):
     )
     met_samples: int = option(2000, "number of clouds from these rollouts")
     labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds together")
+    max_epochs: float | None = option(
+        None,
+        "most passes over the training samples or labels, where algo.epochs asks for more; null: no limit",
+        within="(0, inf)",
+    )
     eval_samples: int = option(8, "samples of each held-out object on which the flow is measured", within="[1, inf)")
     workers: int | None = option(None, "worker processes that draw samples; null: one per core", within="[0, inf)")
+
+    def passes(self, epochs: float) -> float:
+        """How often a fit that asks for ``epochs`` draws each sample or label."""
+        return min(epochs, self.max_epochs or epochs)
