@@ -63,8 +63,8 @@ class DataOptions(SampleOptions):
     )
     met_by: str | None = option(
         None,
-        "an ArtFlowNet (checkpoint.pt, .safetensors): clouds from rollouts of its policy with the training objects are "
-        "training samples, too",
+        "an ArtFlowNet (run folder, checkpoint.pt, .safetensors): clouds from rollouts of its policy with the training "
+        "objects are training samples, too",
     )
     met_samples: int = option(2000, "number of clouds from these rollouts")
     labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds together")
