@@ -21,6 +21,7 @@ import numpy as np
 from fb3d_rl.errors import UserError
 from fb3d_rl.procedural import (
     appliances,
+    bodies,
     caps,
     controls,
     folding,
@@ -122,7 +123,7 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), group])
     spec = makers[variant](rng)
     if rng.random() < SKEWED:
-        spec = spec.turned(rng.uniform(-SKEW, SKEW))
+        spec = bodies.yaw(rng.uniform(-SKEW, SKEW)).spec(spec)
     return spec.normalised()
 
 

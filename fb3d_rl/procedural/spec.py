@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from fb3d_rl.procedural.shapes import Piece, Vector
 
@@ -81,23 +80,6 @@ class ObjectSpec:
         shift = -scale * (low + high) / 2
         body = tuple(piece.transformed(scale, shift) for piece in self.body)
         return replace(self, body=body, parts=tuple(part.moved(scale, shift) for part in self.parts))
-
-    def turned(self, angle: float) -> ObjectSpec:
-        """The object turned about the vertical by an angle, rad, so that its axes run along no coordinate axis."""
-        turn = Rotation.from_rotvec([0.0, angle, 0.0])
-
-        def vector(values: Vector) -> Vector:
-            x, y, z = turn.apply(values).tolist()
-            return x, y, z
-
-        def pieces(items: tuple[Piece, ...]) -> tuple[Piece, ...]:
-            return tuple(replace(piece, vertices=turn.apply(piece.vertices)) for piece in items)
-
-        parts = [
-            replace(part, axis=vector(part.axis), origin=vector(part.origin), pieces=pieces(part.pieces))
-            for part in self.parts
-        ]
-        return replace(self, body=pieces(self.body), parts=tuple(parts))
 
 
 def write_object(spec: ObjectSpec, folder: Path, object_id: str) -> None:
