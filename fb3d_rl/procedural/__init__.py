@@ -35,16 +35,7 @@ from fb3d_rl.procedural import (
 )
 from fb3d_rl.procedural.spec import ObjectSpec, Part, write_object
 
-__all__ = [
-    "FAMILIES",
-    "LOOKALIKES",
-    "MECHANISMS",
-    "ObjectSpec",
-    "Part",
-    "generate",
-    "object_id",
-    "sample",
-]
+__all__ = ["FAMILIES", "LOOKALIKES", "MECHANISMS", "ObjectSpec", "Part", "generate", "object_id", "sample"]
 
 MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "PushButton": controls.push_button,
@@ -66,7 +57,7 @@ MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
 """Kinds of motion on bodies of any kind, size and orientation."""
 
 LOOKALIKES: dict[str, tuple[Callable[[np.random.Generator], ObjectSpec], ...]] = {
-    "AmbiguousDoor": tuple(partial(lookalikes.ambiguous_door, variant=k) for k in range(lookalikes.VARIANTS)),
+    "AmbiguousDoor": tuple(partial(lookalikes.ambiguous_door, variant=k) for k in range(lookalikes.VARIANTS))
 }
 """Families in groups: so many objects with successive indices look alike, and each moves in its own way."""
 

@@ -7,18 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, rod
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, rod
 from fb3d_rl.procedural.spec import Part
 
 Side = Literal["left", "right", "bottom", "top"]
 OPPOSITE: dict[Side, Side] = {"left": "right", "right": "left", "bottom": "top", "top": "bottom"}
 # Hinge axes about which a panel in front of the body turns outwards (towards +z) for positive angles.
-HINGE_AXIS: dict[Side, Vector] = {
-    "left": (0, -1, 0),
-    "right": (0, 1, 0),
-    "bottom": (1, 0, 0),
-    "top": (-1, 0, 0),
-}
+HINGE_AXIS: dict[Side, Vector] = {"left": (0, -1, 0), "right": (0, 1, 0), "bottom": (1, 0, 0), "top": (-1, 0, 0)}
 
 
 BEHIND = 0.0015
@@ -188,10 +183,7 @@ def _hollowed(
 ) -> list[Piece]:
     """A panel that is thinner within a rectangle, by `depth` of its thickness."""
     return [
-        box(name, (x[0], hole_x[0]), y, z),
-        box(name, (hole_x[1], x[1]), y, z),
-        box(name, hole_x, (y[0], hole_y[0]), z),
-        box(name, hole_x, (hole_y[1], y[1]), z),
+        *around(name, x, y, z, (hole_x, hole_y)),
         box(floor, hole_x, hole_y, (z[0], z[1] - depth * (z[1] - z[0]))),
     ]
 
@@ -226,13 +218,7 @@ def swing_room(width: float, thickness: float) -> float:
 
 
 def drawer(
-    style: FrontStyle,
-    x: Range,
-    y: Range,
-    z: Range,
-    tray: tuple[Range, Range, Range],
-    sheet: float,
-    upper: float,
+    style: FrontStyle, x: Range, y: Range, z: Range, tray: tuple[Range, Range, Range], sheet: float, upper: float
 ) -> Part:
     """An open-topped tray of sheets `sheet` m thick, with the front panel x, y, z; it slides to the front."""
     tx, ty, tz = tray

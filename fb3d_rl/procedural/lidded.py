@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, circle, loft, rectangle, rod, slab, wall
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, circle, loft, rectangle, rod, slab, wall
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
@@ -268,12 +268,10 @@ def laptop(rng: np.random.Generator) -> ObjectSpec:
     over = rng.uniform(0.0, 0.025)  # the screen stands out a little in front, where fingers lift it
     front = z[1] + over
     field = (bottom + 0.2 * screen, y[1])
+    inside = (x[0] + bezel, x[1] - bezel), (z[0] + bezel, front - bezel)
     pieces = [
-        box("screen_frame", (x[0], x[0] + bezel), y, (z[0], front)),
-        box("screen_frame", (x[1] - bezel, x[1]), y, (z[0], front)),
-        box("screen_frame", (x[0] + bezel, x[1] - bezel), y, (z[0], z[0] + bezel)),
-        box("screen_frame", (x[0] + bezel, x[1] - bezel), y, (front - bezel, front)),
-        box("screen", (x[0] + bezel, x[1] - bezel), field, (z[0] + bezel, front - bezel)),
+        *around("screen_frame", x, y, (z[0], front), inside, lying=True),
+        box("screen", inside[0], field, inside[1]),
     ]
     parts = (Part("screen", "hinge", (-1, 0, 0), rng.uniform(1.6, 2.2), tuple(pieces), (0.0, bottom, z[0])),)
     return ObjectSpec("Laptop", "free", "laptop_base", tuple(body), parts)
