@@ -64,7 +64,6 @@ from fb3d_rl.training.state import check_state
 if TYPE_CHECKING:
     from fb3d_rl.algos.options import ImitationOptions
     from fb3d_rl.config import TrainConfig
-    from fb3d_rl.data.options import DataOptions
 
 BUFFER = "buffer"
 
@@ -160,7 +159,7 @@ class Run:
             networks(self.learner).load_state_dict(done.learner)
             self.policy.gate.load_state_dict(done.gate)
             if done.fit is not None:
-                options = fit_options(self.algo, self.cfg.data, self.cfg.seed, done.round)
+                options = fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, done.round)
                 check_state(networks(self.learner), options, done.fit)
         return done
 
@@ -265,7 +264,7 @@ class Run:
     def fit(self, number: int, log: RunLog) -> None:
         """Fit the learner to all rows; checkpoints are saved meanwhile."""
         done, before = self.done, self.steps_before(number)
-        options = fit_options(self.algo, self.cfg.data, self.cfg.seed, number)
+        options = fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, number)
 
         def checkpoint(state: dict[str, Any]) -> None:
             done.fit, done.log_rows = state, log.rows
@@ -296,7 +295,7 @@ class Run:
 
     def steps_before(self, number: int) -> int:
         """Optimizer steps of the rounds before ``number``."""
-        return sum(round_steps(self.algo, self.cfg.data, i) for i in range(number))
+        return sum(round_steps(self.algo, self.cfg.data.labels, i) for i in range(number))
 
     @property
     def labels(self) -> int:
@@ -372,14 +371,14 @@ def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> 
     return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], tuple(further), algo.oracle)
 
 
-def fit_options(algo: ImitationOptions, data: DataOptions, seed: int, number: int) -> FitOptions:
+def fit_options(algo: ImitationOptions, labels: int, seed: int, number: int) -> FitOptions:
     """How the learner is fitted in a round; each round has a warm-up and a decay of the learning rate."""
-    return taken(FitOptions, algo, steps=round_steps(algo, data, number), seed=numbered_seed(seed, "round", number))
+    return taken(FitOptions, algo, steps=round_steps(algo, labels, number), seed=numbered_seed(seed, "round", number))
 
 
-def round_steps(algo: ImitationOptions, data: DataOptions, number: int) -> int:
+def round_steps(algo: ImitationOptions, labels: int, number: int) -> int:
     """A round's share of the optimizer steps: ``algo.epochs`` draws of each label in all, and at least one a round."""
-    total = max(algo.rounds, math.ceil(data.passes(algo.epochs) * data.labels / algo.batch_size))
+    total = max(algo.rounds, math.ceil(algo.epochs * labels / algo.batch_size))
     return share(total, algo.rounds, number)
 
 

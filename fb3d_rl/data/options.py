@@ -58,6 +58,9 @@ class DataOptions(SampleOptions):
     """Flow samples, data sets of them, and the expert's labels."""
 
     train_samples: int = option(4000, "samples to train flow networks on")
+    max_epochs: float | None = option(
+        None, "most passes over them, where algo.epochs asks for more; null: no limit", within="(0, inf)"
+    )
     dataset: str | None = option(
         None, "the folder samples/ of another run, to train on its samples; null: draw new ones"
     )
@@ -68,14 +71,5 @@ class DataOptions(SampleOptions):
     )
     met_samples: int = option(2000, "number of clouds from these rollouts")
     labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds together")
-    max_epochs: float | None = option(
-        None,
-        "most passes over the training samples or labels, where algo.epochs asks for more; null: no limit",
-        within="(0, inf)",
-    )
     eval_samples: int = option(8, "samples of each held-out object on which the flow is measured", within="[1, inf)")
     workers: int | None = option(None, "worker processes that draw samples; null: one per core", within="[0, inf)")
-
-    def passes(self, epochs: float) -> float:
-        """How often a fit that asks for ``epochs`` draws each sample or label."""
-        return min(epochs, self.max_epochs or epochs)
