@@ -54,7 +54,7 @@ class TrainConfig(CommandConfig):
 class EvaluateConfig(CommandConfig):
     """Everything that launch/evaluate.py needs."""
 
-    checkpoint: str | None = option(None, "a file that launch/train.py wrote")
+    checkpoint: str | None = option(None, "a run folder of launch/train.py, or a file of its weights")
     resume: bool = option(False, "go on from the rows in the run folder; name it with hydra.run.dir=DIR")
 
 
@@ -63,7 +63,7 @@ class ViewConfig(CommandConfig):
     """Everything that launch/view.py needs."""
 
     checkpoint: str | None = option(
-        None, "an ArtFlowNet: checkpoint.pt, .safetensors or pretrained; null shows only the true flow"
+        None, "an ArtFlowNet: run folder, checkpoint.pt, .safetensors or pretrained; null shows only the true flow"
     )
     object: Any = option(
         None, "the folder of an object, an id, or a category, whose first object is shown; null: the first object"
@@ -118,7 +118,7 @@ def validate(cfg: CommandConfig) -> None:
         acting = cfg.algo.name
         _validate_training(cfg)
     if isinstance(cfg, EvaluateConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
-        raise UserError(f"policy={acting} needs checkpoint=PATH, a checkpoint.pt that launch/train.py wrote")
+        raise UserError(f"policy={acting} needs checkpoint=PATH, a run folder of launch/train.py or its checkpoint.pt")
     if isinstance(cfg, ViewConfig):
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:

@@ -33,7 +33,7 @@ class Entry:
     meaning: str
 
 
-F32, BOOL, I64 = torch.float32, torch.bool, torch.int64
+F32, BOOL = torch.float32, torch.bool
 
 GROUPS: dict[str, dict[Key, Entry]] = {
     "observation": {
@@ -68,12 +68,7 @@ GROUPS: dict[str, dict[Key, Entry]] = {
 }
 GROUPS["sample"] = {
     key: GROUPS[key[0]][key]
-    for key in (
-        ("observation", "points"),
-        ("observation", "valid"),
-        ("observation", "part_mask"),
-        ("privileged", "flow"),
-    )
+    for key in (*(("observation", name) for name in ("points", "valid", "part_mask")), ("privileged", "flow"))
 }
 GROUPS["sample"]["privileged", "link"] = Entry(("N",), torch.int16, "the link that a point lies on, -1 on padding")
 

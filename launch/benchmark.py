@@ -43,23 +43,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return exit_code(lambda: run(options), interrupted="nothing was written")
 
 
-def run(options: argparse.Namespace) -> None:
-    """Measure, print and write."""
-    import torch
-    from rich.console import Console
-    from rich.table import Table
+def check(options: argparse.Namespace) -> None:
+    """Refuse what cannot be measured.
 
-    from fb3d_rl.assets.catalog import find_objects
-    from fb3d_rl.benchmarks import environment as benchmark
-    from fb3d_rl.benchmarks.network import draw_clouds, install_peer, network_speed
-    from fb3d_rl.data.samples import SampleOptions
-    from fb3d_rl.env.options import EnvOptions
+    Raises:
+        UserError: names the wrong option.
+    """
+    import torch
+
     from fb3d_rl.errors import UserError
-    from fb3d_rl.evaluation.tables import number_rows
-    from fb3d_rl.files import write_text
-    from fb3d_rl.kinematics.opening import openable_links
-    from fb3d_rl.rollout.trials import schedule
-    from fb3d_rl.training.checkpoint import git_revision
 
     unknown = [name for name in options.names if name not in BENCHMARKS]
     if unknown:
@@ -69,6 +61,25 @@ def run(options: argparse.Namespace) -> None:
             raise UserError(f"--{key} {getattr(options, key)} is too small; give 1 or more")
     if options.device == "cuda" and not torch.cuda.is_available():
         raise UserError("--device cuda, but torch finds no CUDA device; leave --device cpu")
+
+
+def run(options: argparse.Namespace) -> None:
+    """Measure, print and write."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from fb3d_rl.assets.catalog import find_objects
+    from fb3d_rl.benchmarks import environment as benchmark
+    from fb3d_rl.benchmarks.network import draw_clouds, install_peer, network_speed
+    from fb3d_rl.data.samples import SampleOptions
+    from fb3d_rl.env.options import EnvOptions
+    from fb3d_rl.evaluation.tables import number_rows
+    from fb3d_rl.files import write_text
+    from fb3d_rl.kinematics.opening import openable_links
+    from fb3d_rl.rollout.trials import schedule
+    from fb3d_rl.training.checkpoint import git_revision
+
+    check(options)
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())

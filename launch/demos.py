@@ -96,12 +96,12 @@ def record(options: argparse.Namespace) -> None:
         if value is not None and value < least:
             raise UserError(f"--{key} {value} is too small; give {least} or more")
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from fb3d_rl.data.demonstrations import DemonstrationBuffer
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
     from fb3d_rl.env.torchrl_env import require_simulator
+    from fb3d_rl.evaluation.evaluate import progress_bars
     from fb3d_rl.rollout.collectors import CollectorOptions, Episode
     from fb3d_rl.rollout.demonstrations import Assets, plan, recipe, record_expert
     from fb3d_rl.training.checkpoint import git_revision
@@ -122,9 +122,8 @@ def record(options: argparse.Namespace) -> None:
     buffer = DemonstrationBuffer.create(options.demos, len(scheduled) * env.horizon, about)
     collector = CollectorOptions("direct" if options.workers == 1 else "process", options.workers)
     used = {item.trial.object for item in scheduled}
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     crashed: list[str] = []
-    with Progress(*columns) as bar:
+    with progress_bars() as bar:
         task = bar.add_task("trials", total=len(scheduled))
 
         def progress(episode: Episode, kept: bool) -> None:

@@ -122,6 +122,21 @@ def test_what_the_command_line_says_goes_before_an_experiment() -> None:
     assert compose("evaluate", "experiment=smoke", "collector=process").collector.backend == "process"
 
 
+@pytest.mark.parametrize("algo", sorted(path.stem for path in (CONF / "algo").glob("*.yaml")))
+def test_smoke_bounds_the_steps_of_every_algorithm(algo: str) -> None:
+    from fb3d_rl.algos import dagger, flow_network
+
+    cfg = compose("train", "experiment=smoke", f"algo={algo}")
+    if hasattr(cfg.algo, "rounds"):
+        fits = [dagger.fit_options(cfg.algo, cfg.data.labels, 0, number) for number in range(cfg.algo.rounds)]
+        assert sum(fit.steps for fit in fits) <= 75
+    else:
+        fit = flow_network.fit_options(cfg)
+        assert fit.steps <= 8 and fit.steps * fit.batch_size <= 128  # clouds
+    long = compose("train", "experiment=smoke", "algo=artflownet_paper", "data.max_epochs=null")
+    assert flow_network.fit_options(long).steps == long.algo.epochs == 320
+
+
 def declared(kind: type) -> set[tuple[type, str]]:
     """The keys of options and of the groups in them, each with the class that declares it."""
     own = {(owner(kind, item.name), item.name) for item, _, _ in options.keys(kind)}

@@ -148,7 +148,7 @@ def test_a_kept_data_set_gives_the_same_run(first: Path, tmp_path: Path, config:
 @pytest.mark.slow
 def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:
     same = [item for item in SMALL if not item.startswith(("algo.", "data.train_samples"))]
-    run_evaluation(config("evaluate", [*same, "policy=artflownet", f"checkpoint={first / 'checkpoint.pt'}"]), tmp_path)
+    run_evaluation(config("evaluate", [*same, "policy=artflownet", f"checkpoint={first}"]), tmp_path)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
     assert (tmp_path / "flow_rows.csv").read_bytes() == (first / "flow_rows.csv").read_bytes()
 

@@ -85,19 +85,10 @@ def rollout_samples(
                 barren += 1  # set to 0 below if the trial gives samples
                 if episode is None:
                     continue
-                seen = episode[::every]
-                seen = seen[seen["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5][: count - filled]
+                seen = _labelled(episode[::every], trial.link, number[trial.object])[: count - filled]
                 barren = barren if len(seen) else 0
-                part = slice(filled, filled + len(seen))
-                owner, size = number[trial.object], [len(seen)]
-                rows[part] = seen.select(*KEYS).update(
-                    {
-                        ("privileged", "link"): seen["privileged", "link"].to(torch.int16),
-                        "target": torch.full(size, trial.link),
-                        "object": torch.full(size, owner),
-                    }
-                )
-                filled = part.stop
+                rows[filled : filled + len(seen)] = seen
+                filled += len(seen)
             if barren >= BARREN and filled < count:
                 raise UserError(
                     f"none of the last {barren} trials of the policy data.met_by showed a part that can move; choose "
@@ -106,3 +97,12 @@ def rollout_samples(
             progress(filled)
     finish(out, recipe)
     return rows
+
+
+def _labelled(frames: TensorDictBase, target: int, owner: int) -> TensorDictBase:
+    """The samples among frames [T] of a trial: those that show a part that can move."""
+    seen = frames[frames["privileged", "flow"].norm(dim=-1).amax(-1) > 0.5].select(*KEYS)
+    seen["privileged", "link"] = seen["privileged", "link"].to(torch.int16)
+    seen["target"] = torch.full([len(seen)], target)
+    seen["object"] = torch.full([len(seen)], owner)
+    return seen

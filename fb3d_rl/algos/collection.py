@@ -104,10 +104,20 @@ def collect(
                 count += len(kept)
         if barren >= BARREN:
             raise UserError(f"the last {barren} trials gave no label: {rows.why_none(len(outcomes), error)}")
-    success, contact = np.mean(outcomes, axis=0).tolist()
     ended_at = time.perf_counter()
-    seconds = ended_at - started
-    numbers = {
+    return Round(episodes, _numbers(episodes, outcomes, crashed, steps, ended_at - started), ended_at)
+
+
+def _numbers(
+    episodes: Sequence[tuple[TensorDictBase, EpisodeInfo]],
+    outcomes: Sequence[tuple[bool, bool]],
+    crashed: int,
+    steps: int,
+    seconds: float,
+) -> dict[str, float]:
+    """A round's row of the log; ``outcomes`` are success and contact of each trial that did not crash."""
+    success, contact = np.mean(outcomes, axis=0).tolist()
+    return {
         "collect/success_rate": success,
         "collect/contact_rate": contact,
         "collect/expert_share": expert_share([frames for frames, _ in episodes]),
@@ -116,7 +126,6 @@ def collect(
         "time/collect_seconds": seconds,
         "time/labels_per_s": steps / seconds,
     }
-    return Round(episodes, numbers, ended_at)
 
 
 def expert_share(rows: Sequence[TensorDictBase]) -> float:

@@ -35,7 +35,7 @@ from fb3d_rl.algos.learners import (
     numbered_seed,
     policy_name,
 )
-from fb3d_rl.algos.weights import CHECKPOINT, load_network, state_before
+from fb3d_rl.algos.weights import CHECKPOINT, load_network, state_before, weights_file
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.errors import UserError
@@ -328,6 +328,7 @@ class Imitation:
         The policy raises a UserError if its learner was trained with other limits or another control rate: its history
         and its plans are counted in control steps.
         """
+        path = weights_file(path)
         saved = load_checkpoint(path)
         if REGISTRY.get(saved["algo"]) is not REGISTRY["dagger"]:  # bc has the same entry
             raise UserError(f"{path} is a checkpoint of {saved['algo']}, not of bc or dagger: choose another file.")

@@ -260,7 +260,8 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
         )
     rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
     rows += cfg.data.met_samples if cfg.data.met_by else 0
-    return taken(FitOptions, algo, steps=math.ceil(algo.epochs * rows / algo.batch_size), seed=cfg.seed)
+    epochs = min(algo.epochs, cfg.data.max_epochs or algo.epochs)
+    return taken(FitOptions, algo, steps=math.ceil(epochs * rows / algo.batch_size), seed=cfg.seed)
 
 
 def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:

@@ -28,7 +28,7 @@ class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
         within="(0, inf)",
     )
     start_from: str | None = option(
-        None, "weights to start from, a checkpoint.pt or .safetensors; null: random weights"
+        None, "weights to start from: a run folder, checkpoint.pt or .safetensors; null: random weights"
     )
     backbone: Literal["pointnet2", "delayed"] = option(
         "pointnet2", "the paper's network, or one that is several times as fast"
@@ -71,7 +71,9 @@ class ImitationOptions(OptimizerOptions, AlgoOptions):
     oracle: bool = option(False, "the expert drives to the contact point; the learner acts while suction holds a part")
     members: int = option(1, "number of learners; several are an ensemble", within="[1, inf)")
     learner: LearnerOptions = group(LearnerOptions)
-    flow_checkpoint: str | None = option(None, "an ArtFlowNet's checkpoint.pt, with learner.flow=artflownet")
+    flow_checkpoint: str | None = option(
+        None, "an ArtFlowNet's run folder or checkpoint.pt, with learner.flow=artflownet"
+    )
     demonstrations: str | None = option(
         None, "demonstrations to start from: a buffer that launch/demos.py recorded, imported or filtered"
     )

@@ -43,13 +43,31 @@ def best_cosine(path: Path) -> float:
         raise UserError(f"{path} is damaged ({type(error).__name__}): copy it anew, or delete it") from error
 
 
+def weights_file(path: str | Path) -> Path:
+    """The file of weights that ``path`` names: itself, or of a run folder the weights that its rows and report measure.
+
+    These are the last ones; the best of validation stand for them where nothing else was kept.
+
+    Raises:
+        UserError: the folder holds no weights.
+    """
+    given = Path(path)
+    if str(path) == "pretrained" or not given.is_dir():
+        return given
+    for name in (CHECKPOINT, BEST):
+        if (given / name).is_file():
+            return given / name
+    raise UserError(f"{given} holds no weights ({CHECKPOINT} or {BEST}): give a run folder of launch/train.py")
+
+
 def load_trained(path: str | Path, network: type[CloudNetwork]) -> CloudNetwork:
-    """The network of a checkpoint that its algorithm wrote or of a .safetensors file, or the ArtFlowNet "pretrained".
+    """The network of :func:`weights_file`: of a checkpoint or a .safetensors file; or the ArtFlowNet "pretrained".
 
     Raises:
         UserError: the file is missing or no such checkpoint.
     """
-    if Path(path).suffix == ".safetensors" or (str(path) == "pretrained" and network is ArtFlowNet):
+    path = weights_file(path)
+    if path.suffix == ".safetensors" or (str(path) == "pretrained" and network is ArtFlowNet):
         return network.from_pretrained(path)
     content = load_checkpoint(path, algo=network.NAME)
     with fitting(path):

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.util import append_faces
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.camera.embree import EmbreeScene, triangle_scene
@@ -48,10 +49,9 @@ class RaycastCamera:
         self._corners = np.zeros((len(shapes), 3, 8))  # of the bodies' bounding boxes
         for index, meshes in enumerate(shapes):
             if meshes:
-                vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
-                starts = itertools.accumulate((len(mesh.vertices) for mesh in meshes), initial=0)
-                faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
-                self._scenes[index] = triangle_scene(vertices, np.concatenate(faces).astype(np.int32))
+                together = append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
+                vertices = together[0].astype(np.float32)
+                self._scenes[index] = triangle_scene(vertices, together[1].astype(np.int32))
                 extents = zip(vertices.min(0), vertices.max(0), strict=True)
                 self._corners[index] = np.array(list(itertools.product(*extents))).T
         bounds = standing_bounds(obj)

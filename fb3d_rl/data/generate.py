@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -31,6 +31,10 @@ DONE = "samples.json"
 
 DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError)
 """The exceptions of reading a data set with missing or damaged files."""
+
+
+Job: TypeAlias = tuple[Path, Path, int, np.ndarray, int, SampleOptions]
+"""The arguments of :func:`_draw_object`."""
 
 
 def generate_samples(
@@ -78,6 +82,15 @@ def generate_samples(
     empty_rows(out, count, options.points)
     owner = np.random.default_rng([seed, 0]).permutation(count) % len(folders)
     jobs = [(out / "rows", folder, f, np.flatnonzero(owner == f), seed, options) for f, folder in enumerate(folders)]
+    missing = _draw_objects(jobs, workers, progress)
+    rows = TensorDict.load_memmap(out / "rows")
+    _refill(rows, sorted(missing), count)
+    finish(out, recipe, refilled=len(missing))
+    return rows
+
+
+def _draw_objects(jobs: Sequence[Job], workers: int, progress: Callable[[int], None]) -> list[int]:
+    """:func:`_draw_object` of each job, in this process or in others; the rows that could not be drawn."""
     missing: list[int] = []
     drawn = 0
     if workers == 0:
@@ -85,18 +98,15 @@ def generate_samples(
             missing += _draw_object(*job)
             drawn += len(job[3])
             progress(drawn)
-    else:
-        with worker_pool(workers, _quiet) as pool:
-            with withheld():
-                futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
-            for future in as_completed(futures):
-                missing += future.result()
-                drawn += futures[future]
-                progress(drawn)
-    rows = TensorDict.load_memmap(out / "rows")
-    _refill(rows, sorted(missing), count)
-    finish(out, recipe, refilled=len(missing))
-    return rows
+        return missing
+    with worker_pool(workers, _quiet) as pool:
+        with withheld():
+            futures = {pool.submit(_draw_object, *job): len(job[3]) for job in jobs}
+        for future in as_completed(futures):
+            missing += future.result()
+            drawn += futures[future]
+            progress(drawn)
+    return missing
 
 
 def finished_rows(out: Path, recipe: Mapping[str, Any]) -> TensorDictBase | None:

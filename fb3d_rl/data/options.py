@@ -58,13 +58,16 @@ class DataOptions(SampleOptions):
     """Flow samples, data sets of them, and the expert's labels."""
 
     train_samples: int = option(4000, "samples to train flow networks on")
+    max_epochs: float | None = option(
+        None, "most passes over them, where algo.epochs asks for more; null: no limit", within="(0, inf)"
+    )
     dataset: str | None = option(
         None, "the folder samples/ of another run, to train on its samples; null: draw new ones"
     )
     met_by: str | None = option(
         None,
-        "an ArtFlowNet (checkpoint.pt, .safetensors): clouds from rollouts of its policy with the training objects are "
-        "training samples, too",
+        "an ArtFlowNet (run folder, checkpoint.pt, .safetensors): clouds from rollouts of its policy with the training "
+        "objects are training samples, too",
     )
     met_samples: int = option(2000, "number of clouds from these rollouts")
     labels: int = option(24000, "control steps that the expert labels for imitation, in all rounds together")

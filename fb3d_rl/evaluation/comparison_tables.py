@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 
@@ -76,9 +75,8 @@ def _csv_rows(entry: Entry) -> Iterator[_CsvRow]:
 def _parts(rows: Sequence[TrialRow], field: str, single: bool = False) -> Iterator[tuple[str, list[TrialRow]]]:
     """All rows, then those of each value of ``field``, which is left out if there is but one unless ``single``."""
     yield "all", list(rows)
-    values = sorted({getattr(row, field) for row in rows})
-    for value in values if single or len(values) > 1 else []:
-        yield value, [row for row in rows if getattr(row, field) == value]
+    found = tables.parts(rows, field)
+    yield from found.items() if single or len(found) > 1 else ()
 
 
 def _means_rows(
@@ -136,19 +134,8 @@ def show_difference(metric: Metric, found: Means) -> tuple[str, str]:
 
 
 def show(comparison: Comparison, console: Console | None = None) -> None:
-    """Print the comparison, 100 columns wide where the output is not a terminal."""
-    console = console or Console()
-    if not console.is_terminal:
-        console.width = max(console.width, 100)
-    for table in _tables(comparison):
-        console.print(table)
-
-
-def _table(title: str, *columns: tuple[str, bool]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    for name, number in columns:
-        table.add_column(name, justify="right" if number else "left", overflow="fold")
-    return table
+    """Print the comparison's tables."""
+    tables.print_tables(_tables(comparison), console)
 
 
 def _tables(comparison: Comparison) -> Iterator[Table]:
@@ -156,7 +143,7 @@ def _tables(comparison: Comparison) -> Iterator[Table]:
     names = ("seeds", "n", "contact", "success", "95 %", "over seeds", "class", "dist.", "labels", "expert")
     for split, numbers in splits.items():
         title = f"Comparison, {split}" if split else "Comparison"
-        table = _table(title, ("policy", False), *((name, True) for name in names))
+        table = tables.titled(title, ("policy",), names)
         for entry in comparison.entries:
             if f"{entry.label}/n" not in numbers:
                 continue
@@ -180,11 +167,11 @@ def _tables(comparison: Comparison) -> Iterator[Table]:
     measured = tables.effort_of(comparison.numbers, [entry.label for entry in comparison.entries])
     if measured:
         yield tables.effort_table(comparison.numbers, measured)
-    table = _table(
+    table = tables.titled(
         "Differences on the same trials (success and contact in points)",
-        ("policy", False), ("minus", False), ("n", True), ("success", True), ("95 %", True), ("contact", True),
-        ("95 %", True), ("dist.", True), ("95 %", True),
-    )  # fmt: skip
+        ("policy", "minus"),
+        ("n", "success", "95 %", "contact", "95 %", "dist.", "95 %"),
+    )
     for three in by_pair(comparison):
         shown = (cell for d in three for cell in show_difference(d.metric, d.means))
         table.add_row(three[0].entry.label, three[0].baseline.label, str(three[0].n), *shown)

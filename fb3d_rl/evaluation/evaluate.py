@@ -113,22 +113,8 @@ def evaluate(
         )
     used = {item.trial.object for item in scheduled}
     shown = [obj for obj, _ in objects if obj.id in used]
-    named = {obj.id: obj for obj in shown}
-    keys = [trial_key(named[item.trial.object], item.trial, protocol.env.suction.hold) for item in scheduled]
-    earlier = _rows_before(out / "rows.csv", policies, keys) if protocol.resume and scheduled else {}
-    times = DecisionTimes(out, [row for done in earlier.values() for row in done.values()])
-    rows: list[TrialRow] = []
-    with progress_bars() as bar:
-        for name, policy in policies.items() if scheduled else ():
-            done = earlier.get(name, {})
-            task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
-            keep = partial(_keep, out / "rows.csv", rows, done, partial(bar.advance, task))
-            _run(name, policy, shown, scheduled, protocol, done, keep, times)
-            rows += [done[number] for number in sorted(done)]
-            median = times.median(name)
-            if median is not None:
-                numbers[f"{name}/{DECISION.key}"] = 1000 * median
-    numbers = summary(rows, measured, numbers)
+    rows, milliseconds = _run_policies(out, policies, shown, scheduled, protocol)
+    numbers = summary(rows, measured, numbers | milliseconds)
     write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
     show(numbers, Console())
     if net is not None and protocol.clouds:
@@ -141,6 +127,33 @@ def evaluate(
                 lambda done, total: bar.update(task, completed=done, total=total),
             )  # fmt: skip
     return rows
+
+
+def _run_policies(
+    out: Path,
+    policies: Mapping[str, TensorDictModuleBase],
+    objects: Sequence[ArticulatedObject],
+    scheduled: Sequence[Scheduled],
+    protocol: Protocol,
+) -> tuple[list[TrialRow], dict[str, float]]:
+    """The rows of every policy, which rows.csv keeps as they come, and the summary's entries on decision times."""
+    named = {obj.id: obj for obj in objects}
+    keys = [trial_key(named[item.trial.object], item.trial, protocol.env.suction.hold) for item in scheduled]
+    earlier = _rows_before(out / "rows.csv", policies, keys) if protocol.resume and scheduled else {}
+    times = DecisionTimes(out, [row for done in earlier.values() for row in done.values()])
+    rows: list[TrialRow] = []
+    milliseconds: dict[str, float] = {}
+    with progress_bars() as bar:
+        for name, policy in policies.items() if scheduled else ():
+            done = earlier.get(name, {})
+            task = bar.add_task(f"trials: {name}", total=len(scheduled), completed=len(done))
+            keep = partial(_keep, out / "rows.csv", rows, done, partial(bar.advance, task))
+            _run(name, policy, objects, scheduled, protocol, done, keep, times)
+            rows += [done[number] for number in sorted(done)]
+            median = times.median(name)
+            if median is not None:
+                milliseconds[f"{name}/{DECISION.key}"] = 1000 * median
+    return rows, milliseconds
 
 
 def progress_bars() -> Progress:

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from fb3d_rl.evaluation.intervals import UNBOUNDED, UNIT, Interval, Means, means
 from fb3d_rl.registry import untrained
-from fb3d_rl.rollout.rows import FlowRow, TrialRow, own_policy, policies
+from fb3d_rl.rollout.rows import FlowRow, Row, TrialRow, own_policy, policies
 
 _POSITIVE: Interval = (0.0, math.inf)
 
@@ -175,6 +175,14 @@ def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | Non
     return out
 
 
+def parts(rows: Iterable[Row], field: str) -> dict[str, list[Row]]:
+    """The rows of each value of ``field``, in the order of these values."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(getattr(row, field), []).append(row)
+    return dict(sorted(found.items()))
+
+
 def summary(
     rows: Sequence[TrialRow], flow_rows: Sequence[FlowRow], extra: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -199,28 +207,15 @@ def summary(
     own = facts.get("policy") or own_policy(rows)
     out: dict[str, Any] = {**facts, "policy": own} if own else facts
     out |= _aggregate(rows, flow_rows, own, classes=True)
-    everything: list[TrialRow | FlowRow] = [*rows, *flow_rows]
-    out["by_category"] = {
-        name: _aggregate(
-            [row for row in rows if row.category == name],
-            [row for row in flow_rows if row.category == name],
-            own,
-            classes=False,
-        )
-        for name in sorted({row.category for row in everything})
-    }
-    splits = sorted({row.split for row in everything})
-    if len(splits) > 1:
-        out["by_split"] = {
-            name: _aggregate(
-                [row for row in rows if row.split == name],
-                [row for row in flow_rows if row.split == name],
-                own,
-                classes=True,
-            )
-            for name in splits
-        }
-    return out
+
+    def apart(field: str, classes: bool) -> dict[str, Any]:
+        trials, clouds = parts(rows, field), parts(flow_rows, field)
+        names = sorted({*trials, *clouds})
+        return {name: _aggregate(trials.get(name, []), clouds.get(name, []), own, classes) for name in names}
+
+    out["by_category"] = apart("category", False)
+    by_split = apart("split", True)
+    return out | {"by_split": by_split} if len(by_split) > 1 else out
 
 
 def policies_of(numbers: Mapping[str, Any]) -> list[str]:
@@ -247,18 +242,20 @@ def effort_of(numbers: Mapping[str, Any], names: Sequence[str]) -> list[str]:
     return [name for name in names if any(numbers.get(f"{name}/{key}") is not None for key in keys)]
 
 
+def titled(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
+    """A rich table without rows, with columns of words and then of numbers."""
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    for name in words:
+        table.add_column(name, overflow="fold")
+    for name in numbers:
+        table.add_column(name, justify="right", overflow="fold")
+    return table
+
+
 def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
     """The effort of trials, as a rich table with a row for each of the policies ``names``."""
-    table = Table(
-        title="What it took, steps and seconds until success",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        show_edge=False,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("policy", overflow="fold")
-    for heading in ("steps", "seconds", "way of the tip, m", "times lost", "ms a decision"):
-        table.add_column(heading, justify="right")
+    columns = ("steps", "seconds", "way of the tip, m", "times lost", "ms a decision")
+    table = titled("What it took, steps and seconds until success", ("policy",), columns)
     for name in names:
         table.add_row(name, *(m.show(numbers.get(f"{name}/{m.key}")) for m in (*EFFORT, DECISION)))
     return table
@@ -271,12 +268,7 @@ def unmasked(numbers: Mapping[str, Any]) -> list[str]:
 
 def unmasked_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
     """What the policies ``names`` opened that saw no part mask, as a rich table with a row for each."""
-    table = Table(
-        title="Without a part mask", title_justify="left", box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0)
-    )
-    table.add_column("policy", overflow="fold")
-    for heading in ("opened the target", "95 %", "opened what it held", "95 %"):
-        table.add_column(heading, justify="right")
+    table = titled("Without a part mask", ("policy",), ("opened the target", "95 %", "opened what it held", "95 %"))
     for name in names:
         keys = [(metric, f"{name}/{metric.key}") for metric in (SUCCESS, HELD)]
         cells = [(m.show(numbers.get(key)), m.show_interval(numbers.get(f"{key}_ci95"))) for m, key in keys]
@@ -347,13 +339,19 @@ def _inner() -> Table:
     return Table(box=box.SIMPLE_HEAD, show_edge=False, padding=0, pad_edge=False)
 
 
-def show(numbers: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print a summary's tables, 100 columns wide where the output is not a terminal."""
+def print_tables(listed: Iterable[Table], console: Console | None = None) -> Console:
+    """Print tables, 100 columns wide where the output is not a terminal."""
     console = console or Console()
     if not console.is_terminal:
         console.width = max(console.width, 100)
-    for table in tables(numbers):
+    for table in listed:
         console.print(table)
+    return console
+
+
+def show(numbers: Mapping[str, Any], console: Console | None = None) -> None:
+    """Print a summary's tables and what to know about them."""
+    console = print_tables(tables(numbers), console)
     if note := trainings(numbers):
         console.print(note, style="dim", highlight=False)
 

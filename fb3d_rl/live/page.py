@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from trimesh.util import append_faces
 
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.assets.gripper import gripper_meshes
@@ -265,9 +266,7 @@ class Page:
         if not meshes:
             self._server.scene.remove_by_name(name)
             return None
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
-        vertices = np.concatenate([mesh.vertices for mesh in meshes])
-        faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
+        vertices, faces = append_faces([mesh.vertices for mesh in meshes], [mesh.faces for mesh in meshes])
         return self._server.scene.add_mesh_simple(
             name, vertices.astype(np.float32), faces.astype(np.uint32), color=color, side="double", **style
         )

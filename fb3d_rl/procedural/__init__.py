@@ -21,6 +21,7 @@ import numpy as np
 from fb3d_rl.errors import UserError
 from fb3d_rl.procedural import (
     appliances,
+    bodies,
     caps,
     controls,
     folding,
@@ -34,16 +35,7 @@ from fb3d_rl.procedural import (
 )
 from fb3d_rl.procedural.spec import ObjectSpec, Part, write_object
 
-__all__ = [
-    "FAMILIES",
-    "LOOKALIKES",
-    "MECHANISMS",
-    "ObjectSpec",
-    "Part",
-    "generate",
-    "object_id",
-    "sample",
-]
+__all__ = ["FAMILIES", "LOOKALIKES", "MECHANISMS", "ObjectSpec", "Part", "generate", "object_id", "sample"]
 
 MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
     "PushButton": controls.push_button,
@@ -65,7 +57,7 @@ MECHANISMS: dict[str, Callable[[np.random.Generator], ObjectSpec]] = {
 """Kinds of motion on bodies of any kind, size and orientation."""
 
 LOOKALIKES: dict[str, tuple[Callable[[np.random.Generator], ObjectSpec], ...]] = {
-    "AmbiguousDoor": tuple(partial(lookalikes.ambiguous_door, variant=k) for k in range(lookalikes.VARIANTS)),
+    "AmbiguousDoor": tuple(partial(lookalikes.ambiguous_door, variant=k) for k in range(lookalikes.VARIANTS))
 }
 """Families in groups: so many objects with successive indices look alike, and each moves in its own way."""
 
@@ -122,7 +114,7 @@ def sample(category: str, seed: int, index: int) -> ObjectSpec:
     rng = np.random.default_rng([seed, zlib.crc32(category.encode()), group])
     spec = makers[variant](rng)
     if rng.random() < SKEWED:
-        spec = spec.turned(rng.uniform(-SKEW, SKEW))
+        spec = bodies.yaw(rng.uniform(-SKEW, SKEW)).spec(spec)
     return spec.normalised()
 
 

@@ -21,13 +21,7 @@ def refrigerator(rng: np.random.Generator) -> ObjectSpec:
     side: CellKind = "left" if rng.random() < LEFT_HINGED else "right"
     small, large = Cell(side, rng.uniform(0.35, 0.7), 1), Cell(side, 1.0, int(rng.integers(1, 4)))
     double = Cell("double", 1.0, int(rng.integers(1, 4)))
-    layouts = [
-        [large],
-        [large, small],
-        [small, large],
-        [double],
-        [Cell("drawer", rng.uniform(0.3, 0.5)), double],
-    ]
+    layouts = [[large], [large, small], [small, large], [double], [Cell("drawer", rng.uniform(0.3, 0.5)), double]]
     cells = layouts[int(rng.choice(len(layouts), p=[0.15, 0.25, 0.25, 0.2, 0.15]))]
     body, parts = build(
         rng,
@@ -50,10 +44,7 @@ def microwave(rng: np.random.Generator) -> ObjectSpec:
     """A door with a window beside a control panel."""
     size = scaled_size(rng.uniform(1.3, 1.9), rng.uniform(0.75, 1.1), rng.uniform(0.8, 1.2))
     mirrored = rng.random() < 0.2
-    columns = [
-        Column([Cell("right" if mirrored else "left")], rng.uniform(2.2, 4.0)),
-        Column([Cell("controls")], 1.0),
-    ]
+    columns = [Column([Cell("right" if mirrored else "left")], rng.uniform(2.2, 4.0)), Column([Cell("controls")], 1.0)]
     handle = draw_handle(rng, bare=0.15)
     if handle.kind == "bar":
         handle = replace(handle, length=rng.uniform(0.5, 0.85), shift=0.0)
@@ -105,11 +96,7 @@ def _with_dial(rng: np.random.Generator, door: Part) -> Part:
     (x0, y0, z0), (x1, y1, z1) = points.min(0), points.max(0)
     cx, cy = (x0 + x1) / 2, y0 + rng.uniform(0.4, 0.75) * (y1 - y0)
     dial = rod(
-        "dial",
-        (cx, cy, (z0 + z1) / 2),
-        (cx, cy, z1 + rng.uniform(0.02, 0.05)),
-        rng.uniform(0.04, 0.1),
-        sides=16,
+        "dial", (cx, cy, (z0 + z1) / 2), (cx, cy, z1 + rng.uniform(0.02, 0.05)), rng.uniform(0.04, 0.1), sides=16
     )
     if rng.random() < 0.4:
         length, at = rng.uniform(0.08, 0.16), z1 + rng.uniform(0.03, 0.06)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, circle, loft, rod, slab
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, circle, loft, rod, slab
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 Half = tuple[float, float]
@@ -103,12 +103,8 @@ def ring(name: str, outer: float, inner: float, z: Range, sides: int = 16) -> li
 
 def holed(name: str, half: Half, hole: Half, z: Range, is_round: bool = False) -> list[Piece]:
     """A rectangular plate with a rectangular hole in its middle, or a round one of radius hole[0] in a square one."""
-    pieces = [
-        box(name, (-half[0], -hole[0]), (-half[1], half[1]), z),
-        box(name, (hole[0], half[0]), (-half[1], half[1]), z),
-        box(name, (-hole[0], hole[0]), (-half[1], -hole[1]), z),
-        box(name, (-hole[0], hole[0]), (hole[1], half[1]), z),
-    ]
+    (x, y), (hole_x, hole_y) = (((-a, a), (-b, b)) for a, b in (half, hole))
+    pieces = around(name, x, y, z, (hole_x, hole_y))
     if is_round:  # sectors between the circle and a square, whose corners are corners of sectors
         rim = circle(16, phase=0.0)
         square = rim / np.abs(rim).max(1, keepdims=True)

@@ -191,12 +191,7 @@ def _controls(rng: np.random.Generator, x: Range, y: Range, z: Range) -> list[Pi
             pieces.append(rod("knob", (cx, cy, z[0]), (cx, cy, z[1] + stand), size))
         else:
             pieces.append(
-                box(
-                    "button",
-                    (cx - size, cx + size),
-                    (cy - 0.6 * size, cy + 0.6 * size),
-                    (z[0], z[1] + 0.4 * stand),
-                )
+                box("button", (cx - size, cx + size), (cy - 0.6 * size, cy + 0.6 * size), (z[0], z[1] + 0.4 * stand))
             )
     return pieces
 

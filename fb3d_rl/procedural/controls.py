@@ -12,14 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.procedural.bodies import (
-    Half,
-    Pose,
-    draw_body,
-    holed,
-    prism,
-    quarter,
-)
+from fb3d_rl.procedural.bodies import Half, Pose, draw_body, holed, prism, quarter
 from fb3d_rl.procedural.shapes import Piece, box, rod
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 

@@ -5,16 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.procedural.bodies import (
-    Half,
-    Pose,
-    any_yaw,
-    chamfered,
-    draw_body,
-    pitch,
-    prism,
-    quarter,
-)
+from fb3d_rl.procedural.bodies import Half, Pose, any_yaw, chamfered, draw_body, pitch, prism, quarter
 from fb3d_rl.procedural.controls import CLEAR
 from fb3d_rl.procedural.shapes import Piece, Range, box, rod
 from fb3d_rl.procedural.spec import ObjectSpec, Part

@@ -6,15 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fb3d_rl.procedural.fronts import (
-    FrontStyle,
-    Side,
-    draw_handle,
-    hinged_door,
-    panel,
-    swing_room,
-)
-from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, housing, rod
+from fb3d_rl.procedural.fronts import FrontStyle, Side, draw_handle, hinged_door, panel, swing_room
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, housing, rod
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
@@ -109,10 +102,7 @@ def window(rng: np.random.Generator) -> ObjectSpec:
     pane_y = (y[0] + bar + clearance, y[1] - bar - clearance)
     lap = rng.uniform(0.02, 0.06)  # the panes overlap in the middle, one track behind the other
     left, right = (x[0] + bar + clearance, lap / 2), (-lap / 2, x[1] - bar - clearance)
-    tracks = [
-        (-sheet - clearance / 2, -clearance / 2),
-        (-2 * sheet - 1.5 * clearance, -sheet - 1.5 * clearance),
-    ]
+    tracks = [(-sheet - clearance / 2, -clearance / 2), (-2 * sheet - 1.5 * clearance, -sheet - 1.5 * clearance)]
     front_is_left = rng.random() < 0.5
     panes = (
         [(left, tracks[0], 1.0), (right, tracks[1], -1.0)]
@@ -148,10 +138,7 @@ def washing_machine(rng: np.random.Generator) -> ObjectSpec:
     front = (z[1] - sheet, z[1])
     body = [
         *housing(x, y, (z[0], front[0]), sheet),
-        box("front_panel", (x[0], cx - hole), y, front),
-        box("front_panel", (cx + hole, x[1]), y, front),
-        box("front_panel", (cx - hole, cx + hole), (0.0, cy - hole), front),
-        box("front_panel", (cx - hole, cx + hole), (cy + hole, height), front),
+        *around("front_panel", x, y, front, ((cx - hole, cx + hole), (cy - hole, cy + hole))),
     ]
     knob = (x[0] + rng.uniform(0.2, 0.8) * width, height - controls / 2)
     body.append(rod("knob", (*knob, front[0]), (*knob, z[1] + rng.uniform(0.01, 0.03)), 0.25 * controls, sides=16))
@@ -162,24 +149,12 @@ def washing_machine(rng: np.random.Generator) -> ObjectSpec:
     ring: Vector = (cx, cy, near)
     pieces = [
         rod("door_frame", ring, (cx, cy, far), radius, sides=24),
-        rod(
-            "glass",
-            (cx, cy, far),
-            (cx, cy, far + rng.uniform(0.01, 0.04)),
-            0.75 * radius,
-            0.6 * radius,
-            sides=24,
-        ),
+        rod("glass", (cx, cy, far), (cx, cy, far + rng.uniform(0.01, 0.04)), 0.75 * radius, 0.6 * radius, sides=24),
     ]
     grip = rng.uniform(0.04, 0.1)
     inward, outward = sorted((cx + sign * 0.85 * radius, cx + sign * 0.95 * radius))
     pieces.append(
-        box(
-            "handle",
-            (inward, outward),
-            (cy - grip, cy + grip),
-            (near + thickness / 2, far + rng.uniform(0.02, 0.05)),
-        )
+        box("handle", (inward, outward), (cy - grip, cy + grip), (near + thickness / 2, far + rng.uniform(0.02, 0.05)))
     )
     axis: Vector = (0, -sign, 0)
     door_part = Part("door", "hinge", axis, rng.uniform(1.4, 2.2), tuple(pieces), (cx - sign * radius, cy, far))
@@ -204,10 +179,7 @@ def _top_loader(rng: np.random.Generator, width: float, height: float, depth: fl
         box("front_panel", inner, (0.0, deck[0]), (z[1] - sheet, z[1])),
         box("back_panel", inner, (0.0, deck[0]), (z[0], z[0] + sheet)),
         box("bottom_panel", inner, (0.0, sheet), (z[0] + sheet, z[1] - sheet)),
-        box("top_panel", (x[0], hole_x[0]), deck, z),
-        box("top_panel", (hole_x[1], x[1]), deck, z),
-        box("top_panel", hole_x, deck, (z[0], hole_z[0])),
-        box("top_panel", hole_x, deck, (hole_z[1], z[1])),
+        *around("top_panel", x, deck, z, (hole_x, hole_z), lying=True),
         box("control_panel", x, (y[1], height), panel_z),
     ]
     for share in np.linspace(0.2, 0.8, int(rng.integers(1, 5))):

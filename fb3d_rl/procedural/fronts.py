@@ -7,18 +7,13 @@ from typing import Literal
 
 import numpy as np
 
-from fb3d_rl.procedural.shapes import Piece, Range, Vector, box, rod
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, rod
 from fb3d_rl.procedural.spec import Part
 
 Side = Literal["left", "right", "bottom", "top"]
 OPPOSITE: dict[Side, Side] = {"left": "right", "right": "left", "bottom": "top", "top": "bottom"}
 # Hinge axes about which a panel in front of the body turns outwards (towards +z) for positive angles.
-HINGE_AXIS: dict[Side, Vector] = {
-    "left": (0, -1, 0),
-    "right": (0, 1, 0),
-    "bottom": (1, 0, 0),
-    "top": (-1, 0, 0),
-}
+HINGE_AXIS: dict[Side, Vector] = {"left": (0, -1, 0), "right": (0, 1, 0), "bottom": (1, 0, 0), "top": (-1, 0, 0)}
 
 
 BEHIND = 0.0015
@@ -105,62 +100,53 @@ def handle(style: HandleStyle, x: Range, y: Range, z: Range, edge: Side | None) 
     inset = min(max(style.inset, thickness), 0.3 * width)
     length = max(style.length * run, 2.5 * thickness)
     if edge is None:
-        middle_across, shift = (across[0] + across[1]) / 2, 0.0
-        lip_across = across[1] - thickness
+        beside, lip, shift = (across[0] + across[1]) / 2, across[1] - thickness, 0.0
     else:
         low = edge in ("left", "bottom")
-        middle_across = across[0] + inset if low else across[1] - inset
-        lip_across = across[0] if low else across[1] - thickness
+        beside = across[0] + inset if low else across[1] - inset
+        lip = across[0] if low else across[1] - thickness
         shift = style.shift if upright else 0.0
-    root, front = (z[0] + z[1]) / 2, z[1]
-    tip = front + style.reach
-
-    def place(name: str, a: Range, c: Range, depth: Range) -> Piece:
-        return box(name, c, a, depth) if upright else box(name, a, c, depth)
-
-    def at(a: float, c: float, depth: float) -> Vector:
-        return (c, a, depth) if upright else (a, c, depth)
-
-    middle_along = (along[0] + along[1]) / 2 + shift * max(run - length, 0.0) / 2
-    low_end, high_end = middle_along - length / 2, middle_along + length / 2
-    half = thickness / 2
-    if style.kind == "lip":
-        return [
-            place(
-                "handle",
-                (low_end, high_end),
-                (lip_across, lip_across + thickness),
-                (root, front + 0.6 * style.reach),
-            )
-        ]
+    depth = ((z[0] + z[1]) / 2, z[1] + style.reach)
     if style.kind == "knob":
-        middle_along = (along[0] + along[1]) / 2 + shift * max(run - 4 * thickness, 0.0) / 2
-        middle_across = min(max(middle_across, across[0] + thickness), across[1] - thickness)
-        neck = front + 0.5 * style.reach
-        return [
-            rod(
-                "handle",
-                at(middle_along, middle_across, root),
-                at(middle_along, middle_across, neck),
-                0.5 * thickness,
-            ),
-            rod(
-                "handle",
-                at(middle_along, middle_across, neck),
-                at(middle_along, middle_across, tip),
-                thickness,
-                0.85 * thickness,
-            ),
-        ]
-    feet = (low_end + thickness, high_end - thickness)
-    if style.round:
-        posts = [rod("handle", at(a, middle_across, root), at(a, middle_across, tip - half), 0.8 * half) for a in feet]
-        bar = rod("handle", at(low_end, middle_across, tip - half), at(high_end, middle_across, tip - half), half)
-    else:
-        strip = (middle_across - half, middle_across + half)
-        posts = [place("handle", (a - half, a + half), strip, (root, tip - thickness)) for a in feet]
-        bar = place("handle", (low_end, high_end), strip, (tip - thickness, tip))
-    return [*posts, bar]
+        middle = (along[0] + along[1]) / 2 + shift * max(run - 4 * thickness, 0.0) / 2
+        beside = min(max(beside, across[0] + thickness), across[1] - thickness)
+        return _knob(upright, middle, beside, depth, z[1] + 0.5 * style.reach, thickness)
+    middle = (along[0] + along[1]) / 2 + shift * max(run - length, 0.0) / 2
+    ends = (middle - length / 2, middle + length / 2)
+    if style.kind == "lip":
+        return [_strip(upright, ends, (lip, lip + thickness), (depth[0], z[1] + 0.6 * style.reach))]
+    return _bar(upright, style.round, ends, beside, depth, thickness)
+
+
+def _strip(upright: bool, along: Range, across: Range, depth: Range) -> Piece:
+    """A box with a range along the panel's free edge, one across it and one in depth."""
+    return box("handle", across, along, depth) if upright else box("handle", along, across, depth)
+
+
+def _point(upright: bool, along: float, across: float, depth: float) -> Vector:
+    """The point at a place along the panel's free edge, across it and in depth."""
+    return (across, along, depth) if upright else (along, across, depth)
+
+
+def _knob(upright: bool, along: float, across: float, depth: Range, neck: float, thickness: float) -> list[Piece]:
+    """A knob from the lower to the upper end of ``depth`` (m), thin up to ``neck``."""
+    root, middle, tip = (_point(upright, along, across, z) for z in (depth[0], neck, depth[1]))
+    return [rod("handle", root, middle, 0.5 * thickness), rod("handle", middle, tip, thickness, 0.85 * thickness)]
+
+
+def _bar(upright: bool, is_round: bool, ends: Range, beside: float, depth: Range, thickness: float) -> list[Piece]:
+    """A bar on two posts, round or square, between its ends along the edge."""
+    (root, tip), half = depth, thickness / 2
+    feet = (ends[0] + thickness, ends[1] - thickness)
+    if not is_round:
+        across = (beside - half, beside + half)
+        posts = [_strip(upright, (a - half, a + half), across, (root, tip - thickness)) for a in feet]
+        return [*posts, _strip(upright, ends, across, (tip - thickness, tip))]
+
+    def straight(a: float, b: float, lower: float, radius: float) -> Piece:
+        return rod("handle", _point(upright, a, beside, lower), _point(upright, b, beside, tip - half), radius)
+
+    return [*(straight(a, a, root, 0.8 * half) for a in feet), straight(*ends, tip - half, half)]
 
 
 def panel(name: str, style: FrontStyle, x: Range, y: Range, z: Range, edge: Side | None) -> list[Piece]:
@@ -197,10 +183,7 @@ def _hollowed(
 ) -> list[Piece]:
     """A panel that is thinner within a rectangle, by `depth` of its thickness."""
     return [
-        box(name, (x[0], hole_x[0]), y, z),
-        box(name, (hole_x[1], x[1]), y, z),
-        box(name, hole_x, (y[0], hole_y[0]), z),
-        box(name, hole_x, (hole_y[1], y[1]), z),
+        *around(name, x, y, z, (hole_x, hole_y)),
         box(floor, hole_x, hole_y, (z[0], z[1] - depth * (z[1] - z[0]))),
     ]
 
@@ -235,13 +218,7 @@ def swing_room(width: float, thickness: float) -> float:
 
 
 def drawer(
-    style: FrontStyle,
-    x: Range,
-    y: Range,
-    z: Range,
-    tray: tuple[Range, Range, Range],
-    sheet: float,
-    upper: float,
+    style: FrontStyle, x: Range, y: Range, z: Range, tray: tuple[Range, Range, Range], sheet: float, upper: float
 ) -> Part:
     """An open-topped tray of sheets `sheet` m thick, with the front panel x, y, z; it slides to the front."""
     tx, ty, tz = tray

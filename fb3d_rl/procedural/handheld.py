@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fb3d_rl.procedural.shapes import Piece, box, circle, housing, loft, rod, slab, wall
+from fb3d_rl.procedural.shapes import Piece, around, box, circle, housing, loft, rod, slab, wall
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
@@ -114,12 +114,10 @@ def phone(rng: np.random.Generator) -> ObjectSpec:
     over = 0.0 if slides else rng.uniform(0.0, 0.025)
     bezel = rng.uniform(0.05, 0.1)
     field = (bottom, y[1] - rng.uniform(0.004, 0.012))
+    inside = (x[0] + bezel, x[1] - bezel), (z[0] + bezel, z[1] + over - bezel)
     pieces = [
-        box("cover_frame", (x[0], x[0] + bezel), y, (z[0], z[1] + over)),
-        box("cover_frame", (x[1] - bezel, x[1]), y, (z[0], z[1] + over)),
-        box("cover_frame", (x[0] + bezel, x[1] - bezel), y, (z[0], z[0] + bezel)),
-        box("cover_frame", (x[0] + bezel, x[1] - bezel), y, (z[1] + over - bezel, z[1] + over)),
-        box("screen", (x[0] + bezel, x[1] - bezel), field, (z[0] + bezel, z[1] + over - bezel)),
+        *around("cover_frame", x, y, (z[0], z[1] + over), inside, lying=True),
+        box("screen", inside[0], field, inside[1]),
     ]
     if slides:
         part = Part("slider", "slider", (0, 0, 1), rng.uniform(0.35, 0.5) * length, tuple(pieces))
@@ -236,12 +234,10 @@ def toilet(rng: np.random.Generator) -> ObjectSpec:
     low = bowl - rng.uniform(0.0, 0.15)
     sheet = rng.uniform(0.025, 0.04)
     x, y, z = (-wide, wide), (low, low + tall), (front - deep, front)
+    inside = (x[0] + sheet, x[1] - sheet), (z[0] + sheet, z[1] - sheet)
     body += [
         box("water_tank", x, (y[0], y[0] + sheet), z),
-        box("water_tank", (x[0], x[0] + sheet), (y[0] + sheet, y[1]), z),
-        box("water_tank", (x[1] - sheet, x[1]), (y[0] + sheet, y[1]), z),
-        box("water_tank", (x[0] + sheet, x[1] - sheet), (y[0] + sheet, y[1]), (z[0], z[0] + sheet)),
-        box("water_tank", (x[0] + sheet, x[1] - sheet), (y[0] + sheet, y[1]), (z[1] - sheet, z[1])),
+        *around("water_tank", x, (y[0] + sheet, y[1]), z, inside, lying=True),
         box("pipe", (-0.4 * half, 0.4 * half), (0.0, y[0]), (front - 0.8 * deep, -0.3 * long)),
     ]
     over = rng.uniform(0.0, 0.02)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
-from fb3d_rl.procedural.shapes import Piece, Range, box, circle, loft, rectangle, rod, slab, wall
+from fb3d_rl.procedural.shapes import Piece, Range, Vector, around, box, circle, loft, rectangle, rod, slab, wall
 from fb3d_rl.procedural.spec import ObjectSpec, Part
 
 
@@ -27,9 +28,21 @@ def kitchen_pot(rng: np.random.Generator) -> ObjectSpec:
         slab("pot_bottom", rim, (0.0, floor), (foot, foot), (at_floor, at_floor)),
         *wall("pot_wall", rim, (floor, height), (at_floor, at_floor), (radius, radius), thickness),
     ]
+    body += _pot_handles(rng, kind, (foot, radius), height, reach, thickness)
+    lid = _pot_lid(rng, rim, (foot, radius), height, thickness, clearance, dome, knob)
+    parts = (Part("lid", "slider", (0, 1, 0), rng.uniform(0.3, 0.6), tuple(lid)),)
+    return ObjectSpec("KitchenPot", "free", "pot_body", tuple(body), parts)
+
+
+def _pot_handles(
+    rng: np.random.Generator, kind: str, radii: Range, height: float, reach: float, thickness: float
+) -> list[Piece]:
+    """Two ears, one long handle or none, that reach so far (m) beyond a pot with these radii (m) at foot and rim."""
+    foot, radius = radii
     grip = rng.uniform(0.025, 0.05)
     high = min(height * rng.uniform(0.72, 0.88), height - grip)
     beside = foot + (radius - foot) * high / height - 0.5 * thickness  # inside the wall's material
+    pieces = []
     if kind == "ears":
         spread = radius * rng.uniform(0.18, 0.35)
         for sign in (-1.0, 1.0):
@@ -37,50 +50,45 @@ def kitchen_pot(rng: np.random.Generator) -> ObjectSpec:
             for z in (-spread, spread):
                 # Starts at the wall's material where the wall curves away from the handle.
                 start = sign * float(np.sqrt(beside**2 - z**2))
-                body.append(rod("handle", (start, high, z), (tip, high, z), grip / 2))
-            body.append(rod("handle", (tip, high, -spread - grip / 2), (tip, high, spread + grip / 2), grip / 2))
+                pieces.append(rod("handle", (start, high, z), (tip, high, z), grip / 2))
+            pieces.append(rod("handle", (tip, high, -spread - grip / 2), (tip, high, spread + grip / 2), grip / 2))
     elif kind == "long":
         sign = 1.0 if rng.random() < 0.5 else -1.0
-        tip = sign * (radius + reach)
-        body.append(
-            rod(
-                "handle",
-                (sign * beside, high, 0.0),
-                (tip, high + rng.uniform(0.0, 0.15) * reach, 0.0),
-                0.6 * grip,
-                0.9 * grip,
-            )
-        )
+        end = (sign * (radius + reach), high + rng.uniform(0.0, 0.15) * reach, 0.0)
+        pieces.append(rod("handle", (sign * beside, high, 0.0), end, 0.6 * grip, 0.9 * grip))
+    return pieces
 
+
+def _pot_lid(
+    rng: np.random.Generator,
+    rim: npt.NDArray[np.float64],
+    radii: Range,
+    height: float,
+    thickness: float,
+    clearance: float,
+    dome: float,
+    knob: float,
+) -> list[Piece]:
+    """A domed lid with a grip on top, `clearance` above the rim of a pot with these radii (m) at foot and rim."""
+    foot, radius = radii
     base = height + clearance
     edge = rng.uniform(0.015, 0.03)
     brim = radius * rng.uniform(0.97, 1.06)
     crown = radius * rng.uniform(0.3, 0.5)
     shoulder = (brim + crown) / 2
-    lid = [
-        slab("lid_surface", rim, (base, base + edge), (brim, brim), (brim, brim)),
-        slab(
-            "lid_surface",
-            rim,
-            (base + edge, base + edge + 0.65 * dome),
-            (0.95 * brim, 0.95 * brim),
-            (shoulder, shoulder),
-        ),
-        slab(
-            "lid_surface",
-            rim,
-            (base + edge + 0.65 * dome, base + edge + dome),
-            (shoulder, shoulder),
-            (crown, crown),
-        ),
-        *_lid_grip(rng, base + edge + dome, knob, 0.8 * crown),
-    ]
+    lid = []
+    for y, lower, upper in (
+        ((base, base + edge), brim, brim),
+        ((base + edge, base + edge + 0.65 * dome), 0.95 * brim, shoulder),
+        ((base + edge + 0.65 * dome, base + edge + dome), shoulder, crown),
+    ):
+        lid.append(slab("lid_surface", rim, y, (lower, lower), (upper, upper)))
+    lid += _lid_grip(rng, base + edge + dome, knob, 0.8 * crown)
     if rng.random() < 0.5:  # a collar that reaches into the pot and keeps the lid in place
         depth = rng.uniform(0.02, 0.05)
         inner = foot + (radius - foot) * (height - depth) / height - thickness - 2 * clearance
         lid.append(slab("lid_collar", rim, (height - depth, base), (inner, inner), (inner, inner)))
-    parts = (Part("lid", "slider", (0, 1, 0), rng.uniform(0.3, 0.6), tuple(lid)),)
-    return ObjectSpec("KitchenPot", "free", "pot_body", tuple(body), parts)
+    return lid
 
 
 def _lid_grip(rng: np.random.Generator, y: float, height: float, width: float) -> list[Piece]:
@@ -131,25 +139,12 @@ def trash_can(rng: np.random.Generator) -> ObjectSpec:
     lid = [slab("lid_surface", outline, (base, base + thick), half, half)]
     if top > 0.02 and rng.random() < 0.6:
         crown = rng.uniform(0.4, 0.85)
-        lid.append(
-            slab(
-                "lid_surface",
-                outline,
-                (base + thick, base + thick + top),
-                half,
-                (half[0] * crown, half[1] * crown),
-            )
-        )
+        y = (base + thick, base + thick + top)
+        lid.append(slab("lid_surface", outline, y, half, (half[0] * crown, half[1] * crown)))
     if rng.random() < 0.7:
         tongue = rng.uniform(0.06, 0.6 * half[0])
-        lid.append(
-            box(
-                "handle",
-                (-tongue, tongue),
-                (base, base + 0.8 * thick),
-                (0.6 * half[1], half[1] + rng.uniform(0.02, 0.07)),
-            )
-        )
+        front = (0.6 * half[1], half[1] + rng.uniform(0.02, 0.07))
+        lid.append(box("handle", (-tongue, tongue), (base, base + 0.8 * thick), front))
     parts = (Part("lid", "hinge", (-1, 0, 0), rng.uniform(1.3, 2.0), tuple(lid), (0.0, base, back)),)
     return ObjectSpec("TrashCan", "free", "trashcan_body", tuple(body), parts)
 
@@ -169,65 +164,57 @@ def storage_box(rng: np.random.Generator) -> ObjectSpec:
     y = (base, height)
     kind = rng.choice(["lid", "sides", "front_back"], p=[0.6, 0.2, 0.2])
     x, z = (-half[0], half[0]), (-half[1], half[1])
-    parts: list[Part]
     if kind == "lid":
-        over = rng.uniform(0.0, 0.03)
-        pieces = [box("lid_surface", (x[0] - over, x[1] + over), y, (z[0], z[1] + over))]
-        if rng.random() < 0.3:  # a vault from side to side
-            pieces += _vault(x, height, z, rng.uniform(0.1, 0.5) * (z[1] - z[0]))
-        elif rng.random() < 0.4:  # a raised, smaller field on top
-            rim = rng.uniform(0.06, 0.15)
-            pieces.append(
-                box(
-                    "lid_field",
-                    (x[0] + rim, x[1] - rim),
-                    (height, height + rng.uniform(0.01, 0.04)),
-                    (z[0] + rim, z[1] - rim),
-                )
-            )
-        grip = rng.choice(["lip", "knob", "none"], p=[0.5, 0.25, 0.25])
-        if grip == "lip":
-            tongue = rng.uniform(0.06, 0.3) * half[0] * 2
-            pieces.append(
-                box(
-                    "handle",
-                    (-tongue / 2, tongue / 2),
-                    (base, base + 0.7 * lid),
-                    (z[1] - 0.05, z[1] + over + rng.uniform(0.02, 0.06)),
-                )
-            )
-        elif grip == "knob":
-            at = z[1] - rng.uniform(0.06, 0.2) * half[1]
-            pieces.append(
-                rod(
-                    "handle",
-                    (0.0, base + lid / 2, at),
-                    (0.0, height + rng.uniform(0.04, 0.09), at),
-                    rng.uniform(0.02, 0.04),
-                )
-            )
-        parts = [Part("rotation_lid", "hinge", (-1, 0, 0), rng.uniform(1.3, 2.1), tuple(pieces), (0.0, base, z[0]))]
+        parts = [_box_lid(rng, x, y, z, lid)]
     else:
-        # Each flap's inner upper edge stays within its closed length, since the hinge lies at its lower edge.
-        gap = 2 * clearance
-        share = rng.uniform(0.35, 0.65)
-        if kind == "sides":
-            cut = x[0] + share * (x[1] - x[0])
-            flaps = [
-                ((x[0], cut - gap), z, (0, 0, 1), (x[0], base, 0.0)),
-                ((cut + gap, x[1]), z, (0, 0, -1), (x[1], base, 0.0)),
-            ]
-        else:
-            cut = z[0] + share * (z[1] - z[0])
-            flaps = [
-                (x, (z[0], cut - gap), (-1, 0, 0), (0.0, base, z[0])),
-                (x, (cut + gap, z[1]), (1, 0, 0), (0.0, base, z[1])),
-            ]
-        parts = [
-            Part("rotation_lid", "hinge", axis, rng.uniform(1.4, 2.2), (box("lid_surface", fx, y, fz),), origin)
-            for fx, fz, axis, origin in flaps
-        ]
+        parts = _box_flaps(rng, kind == "sides", x, y, z, 2 * clearance)
     return ObjectSpec("Box", "free", "box_body", tuple(body), tuple(parts))
+
+
+def _box_lid(rng: np.random.Generator, x: Range, y: Range, z: Range, thickness: float) -> Part:
+    """One lid, hinged at the back: flat, vaulted or with a raised field, with a lip, a knob or nothing to hold."""
+    base, height = y
+    over = rng.uniform(0.0, 0.03)
+    pieces = [box("lid_surface", (x[0] - over, x[1] + over), y, (z[0], z[1] + over))]
+    if rng.random() < 0.3:  # a vault from side to side
+        pieces += _vault(x, height, z, rng.uniform(0.1, 0.5) * (z[1] - z[0]))
+    elif rng.random() < 0.4:  # a raised, smaller field on top
+        rim = rng.uniform(0.06, 0.15)
+        raised = (height, height + rng.uniform(0.01, 0.04))
+        pieces.append(box("lid_field", (x[0] + rim, x[1] - rim), raised, (z[0] + rim, z[1] - rim)))
+    grip = rng.choice(["lip", "knob", "none"], p=[0.5, 0.25, 0.25])
+    if grip == "lip":
+        tongue = rng.uniform(0.06, 0.3) * x[1] * 2
+        front = (z[1] - 0.05, z[1] + over + rng.uniform(0.02, 0.06))
+        pieces.append(box("handle", (-tongue / 2, tongue / 2), (base, base + 0.7 * thickness), front))
+    elif grip == "knob":
+        at = z[1] - rng.uniform(0.06, 0.2) * z[1]
+        top = (0.0, height + rng.uniform(0.04, 0.09), at)
+        pieces.append(rod("handle", (0.0, base + thickness / 2, at), top, rng.uniform(0.02, 0.04)))
+    return Part("rotation_lid", "hinge", (-1, 0, 0), rng.uniform(1.3, 2.1), tuple(pieces), (0.0, base, z[0]))
+
+
+def _box_flaps(rng: np.random.Generator, sides: bool, x: Range, y: Range, z: Range, gap: float) -> list[Part]:
+    """Two flaps, hinged at the sides, or else at front and back."""
+    # Each flap's inner upper edge stays within its closed length, since the hinge lies at its lower edge.
+    base, share = y[0], rng.uniform(0.35, 0.65)
+    flaps: list[tuple[Range, Range, Vector, Vector]]
+    if sides:
+        cut = x[0] + share * (x[1] - x[0])
+        flaps = [
+            ((x[0], cut - gap), z, (0, 0, 1), (x[0], base, 0.0)),
+            ((cut + gap, x[1]), z, (0, 0, -1), (x[1], base, 0.0)),
+        ]
+    else:
+        cut = z[0] + share * (z[1] - z[0])
+        flaps = [
+            (x, (z[0], cut - gap), (-1, 0, 0), (0.0, base, z[0])),
+            (x, (cut + gap, z[1]), (1, 0, 0), (0.0, base, z[1])),
+        ]
+    return [
+        Part("rotation_lid", "hinge", axis, rng.uniform(1.4, 2.2), (box("lid_surface", fx, y, fz),), origin)
+        for fx, fz, axis, origin in flaps
+    ]
 
 
 def _vault(x: Range, y: float, z: Range, rise: float) -> list[Piece]:
@@ -281,12 +268,10 @@ def laptop(rng: np.random.Generator) -> ObjectSpec:
     over = rng.uniform(0.0, 0.025)  # the screen stands out a little in front, where fingers lift it
     front = z[1] + over
     field = (bottom + 0.2 * screen, y[1])
+    inside = (x[0] + bezel, x[1] - bezel), (z[0] + bezel, front - bezel)
     pieces = [
-        box("screen_frame", (x[0], x[0] + bezel), y, (z[0], front)),
-        box("screen_frame", (x[1] - bezel, x[1]), y, (z[0], front)),
-        box("screen_frame", (x[0] + bezel, x[1] - bezel), y, (z[0], z[0] + bezel)),
-        box("screen_frame", (x[0] + bezel, x[1] - bezel), y, (front - bezel, front)),
-        box("screen", (x[0] + bezel, x[1] - bezel), field, (z[0] + bezel, front - bezel)),
+        *around("screen_frame", x, y, (z[0], front), inside, lying=True),
+        box("screen", inside[0], field, inside[1]),
     ]
     parts = (Part("screen", "hinge", (-1, 0, 0), rng.uniform(1.6, 2.2), tuple(pieces), (0.0, bottom, z[0])),)
     return ObjectSpec("Laptop", "free", "laptop_base", tuple(body), parts)

@@ -77,6 +77,17 @@ def box(name: str, x: Range, y: Range, z: Range) -> Piece:
     return loft(name, [(a, y[0], b) for a, b in floor], [(a, y[1], b) for a, b in floor])
 
 
+def around(name: str, x: Range, y: Range, z: Range, hole: tuple[Range, Range], lying: bool = False) -> list[Piece]:
+    """Four boxes of the slab x, y, z around a hole through it: left and right of it, then on its two other sides.
+
+    The hole has ranges in x and y, or in x and z if the slab is `lying`; there is none along the third axis.
+    """
+    hole_x, hole_c = hole
+    c = z if lying else y
+    parts = [((x[0], hole_x[0]), c), ((hole_x[1], x[1]), c), (hole_x, (c[0], hole_c[0])), (hole_x, (hole_c[1], c[1]))]
+    return [box(name, a, y, b) if lying else box(name, a, b, z) for a, b in parts]
+
+
 def housing(x: Range, y: Range, z: Range, sheet: float) -> list[Piece]:
     """Five panels, ``sheet`` m thick, of a hollow box that is open at the front."""
     inner = (x[0] + sheet, x[1] - sheet)
@@ -118,11 +129,7 @@ def level(outline: npt.NDArray[np.float64], half: tuple[float, float], y: float)
 
 
 def slab(
-    name: str,
-    outline: npt.NDArray[np.float64],
-    y: Range,
-    lower: tuple[float, float],
-    upper: tuple[float, float],
+    name: str, outline: npt.NDArray[np.float64], y: Range, lower: tuple[float, float], upper: tuple[float, float]
 ) -> Piece:
     """A solid with the unit outline [n, 2], of half sizes (x, z) `lower` at y[0] and `upper` at y[1]."""
     return loft(name, level(outline, lower, y[0]), level(outline, upper, y[1]))

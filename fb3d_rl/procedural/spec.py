@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from fb3d_rl.procedural.shapes import Piece, Vector
 
@@ -82,81 +81,33 @@ class ObjectSpec:
         body = tuple(piece.transformed(scale, shift) for piece in self.body)
         return replace(self, body=body, parts=tuple(part.moved(scale, shift) for part in self.parts))
 
-    def turned(self, angle: float) -> ObjectSpec:
-        """The object turned about the vertical by an angle, rad, so that its axes run along no coordinate axis."""
-        turn = Rotation.from_rotvec([0.0, angle, 0.0])
-
-        def vector(values: Vector) -> Vector:
-            x, y, z = turn.apply(values).tolist()
-            return x, y, z
-
-        def pieces(items: tuple[Piece, ...]) -> tuple[Piece, ...]:
-            return tuple(replace(piece, vertices=turn.apply(piece.vertices)) for piece in items)
-
-        parts = [
-            replace(part, axis=vector(part.axis), origin=vector(part.origin), pieces=pieces(part.pieces))
-            for part in self.parts
-        ]
-        return replace(self, body=pieces(self.body), parts=tuple(parts))
-
 
 def write_object(spec: ObjectSpec, folder: Path, object_id: str) -> None:
     """Write the object's files into the existing, empty folder."""
-    meshes = folder / "textured_objs"
-    meshes.mkdir()
+    (folder / "textured_objs").mkdir()
     robot = ET.Element("robot", name=f"partnet_{object_id}")
     ET.SubElement(robot, "link", name="base")
-    body_link = f"link_{len(spec.parts)}"
     semantics, mobility = [], []
     links = [*((part, part.pieces) for part in spec.parts), (None, spec.body)]
     number = 0
     for index, (part, pieces) in enumerate(links):
         link = ET.SubElement(robot, "link", name=f"link_{index}")
-        offset = _vector((0.0, 0.0, 0.0) if part is None else [-value for value in part.origin])
-        names = []
-        for piece in pieces:
-            number += 1
-            names.append({"id": number, "name": piece.name, "children": []})
-            mesh = f"textured_objs/original-{number}.obj"
-            (folder / mesh).write_text(_obj(piece), encoding="ascii", newline="\n")
-            visual = ET.SubElement(link, "visual", name=f"{piece.name}-{number}")
-            for element in (visual, ET.SubElement(link, "collision")):
-                ET.SubElement(element, "origin", xyz=offset)
-                ET.SubElement(ET.SubElement(element, "geometry"), "mesh", filename=mesh)
-        joint = ET.SubElement(robot, "joint", name=f"joint_{index}", type=_urdf_type(part))
-        entry: dict[str, object] = {"id": index}
-        if part is None:
-            semantics.append(f"link_{index} {spec.body_joint} {spec.body_name}")
-            ET.SubElement(joint, "origin", rpy=ROOT_RPY, xyz="0 0 0")
-            ET.SubElement(joint, "child", link=f"link_{index}")
-            ET.SubElement(joint, "parent", link="base")
-            entry |= {
-                "parent": -1,
-                "joint": spec.body_joint,
-                "name": spec.body_name,
-                "parts": names,
-                "jointData": {},
-            }
-        else:
-            semantics.append(f"link_{index} {part.joint} {part.name}")
-            ET.SubElement(joint, "origin", xyz=_vector(part.origin))
-            ET.SubElement(joint, "axis", xyz=_vector(part.axis))
-            ET.SubElement(joint, "child", link=f"link_{index}")
-            ET.SubElement(joint, "parent", link=body_link)
-            ET.SubElement(joint, "limit", lower="0", upper=_number(part.upper))
-            # PartNet's own table gives hinges in degrees, sliders in metres.
-            upper = float(np.degrees(part.upper)) if part.joint == "hinge" else part.upper
-            entry |= {
-                "parent": len(spec.parts),
-                "joint": part.joint,
-                "name": part.name,
-                "parts": names,
-                "jointData": {
-                    "axis": {"origin": _rounded(part.origin), "direction": _rounded(part.axis)},
-                    "limit": {"a": 0, "b": _rounded([upper])[0], "noLimit": False},
-                },
-            }
-        mobility.append(entry)
+        origin = (0.0, 0.0, 0.0) if part is None else part.origin
+        numbered = dict(enumerate(pieces, start=number + 1))
+        number += len(pieces)
+        for piece_id, piece in numbered.items():
+            _write_mesh(piece, piece_id, origin, link, folder)
+        _add_joint(robot, part, index, body=len(spec.parts))
+        joint, name = (spec.body_joint, spec.body_name) if part is None else (part.joint, part.name)
+        semantics.append(f"link_{index} {joint} {name}")
+        mobility.append({
+            "id": index,
+            "parent": -1 if part is None else len(spec.parts),
+            "joint": joint,
+            "name": name,
+            "parts": [{"id": piece_id, "name": piece.name, "children": []} for piece_id, piece in numbered.items()],
+            "jointData": {} if part is None else _joint_data(part),
+        })  # fmt: skip
     ET.indent(robot, "\t")
     low, high = spec.bounds()
     texts = {
@@ -168,6 +119,39 @@ def write_object(spec: ObjectSpec, folder: Path, object_id: str) -> None:
     }
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="ascii", newline="\n")
+
+
+def _write_mesh(piece: Piece, number: int, origin: Vector, link: ET.Element, folder: Path) -> None:
+    """Write a piece's file, and add it to the link, whose frame has its origin (m, mesh frame) there."""
+    mesh = f"textured_objs/original-{number}.obj"
+    (folder / mesh).write_text(_obj(piece), encoding="ascii", newline="\n")
+    visual = ET.SubElement(link, "visual", name=f"{piece.name}-{number}")
+    for element in (visual, ET.SubElement(link, "collision")):
+        ET.SubElement(element, "origin", xyz=_vector(-value for value in origin))
+        ET.SubElement(ET.SubElement(element, "geometry"), "mesh", filename=mesh)
+
+
+def _add_joint(robot: ET.Element, part: Part | None, index: int, body: int) -> None:
+    """Add the joint of link ``index``: between a part and link ``body``, or, without a part, of the body itself."""
+    joint = ET.SubElement(robot, "joint", name=f"joint_{index}", type=_urdf_type(part))
+    if part is None:
+        ET.SubElement(joint, "origin", rpy=ROOT_RPY, xyz="0 0 0")
+    else:
+        ET.SubElement(joint, "origin", xyz=_vector(part.origin))
+        ET.SubElement(joint, "axis", xyz=_vector(part.axis))
+    ET.SubElement(joint, "child", link=f"link_{index}")
+    ET.SubElement(joint, "parent", link="base" if part is None else f"link_{body}")
+    if part is not None:
+        ET.SubElement(joint, "limit", lower="0", upper=_number(part.upper))
+
+
+def _joint_data(part: Part) -> dict[str, object]:
+    """PartNet's own table of a joint, which gives hinges in degrees, sliders in metres."""
+    upper = float(np.degrees(part.upper)) if part.joint == "hinge" else part.upper
+    return {
+        "axis": {"origin": _rounded(part.origin), "direction": _rounded(part.axis)},
+        "limit": {"a": 0, "b": _rounded([upper])[0], "noLimit": False},
+    }
 
 
 def _urdf_type(part: Part | None) -> str:

@@ -5,17 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.procedural.bodies import (
-    Pose,
-    any_yaw,
-    chamfered,
-    draw_body,
-    log_uniform,
-    pitch,
-    prism,
-    ring,
-    yaw,
-)
+from fb3d_rl.procedural.bodies import Pose, any_yaw, chamfered, draw_body, log_uniform, pitch, prism, ring, yaw
 from fb3d_rl.procedural.controls import CLEAR
 from fb3d_rl.procedural.shapes import Piece, box, circle, rod, slab
 from fb3d_rl.procedural.spec import ObjectSpec, Part

@@ -188,8 +188,17 @@ def test_a_checkpoint_that_does_not_fit_is_named_before_any_work(first: Path, tm
 
 
 def test_evaluating_the_checkpoint_reproduces_the_runs_rows(first: Path, tmp_path: Path, config: Config) -> None:
-    run_evaluation(config("evaluate", [*SMALL_EVAL, "policy=dagger", f"checkpoint={first / CHECKPOINT}"]), tmp_path)
+    run_evaluation(config("evaluate", [*SMALL_EVAL, "policy=dagger", f"checkpoint={first}"]), tmp_path)
     assert (tmp_path / "rows.csv").read_bytes() == (first / "rows.csv").read_bytes()
+
+
+def test_a_folder_without_weights_is_refused(tmp_path: Path, config: Config) -> None:
+    for policy in ("dagger", "artflownet"):
+        with pytest.raises(UserError, match=r"run holds no weights \(checkpoint\.pt or best\.safetensors\)"):
+            (tmp_path / "run").mkdir(exist_ok=True)
+            words = ["experiment=smoke", f"policy={policy}", f"checkpoint={tmp_path / 'run'}"]
+            run_evaluation(config("evaluate", words), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_learner_acts_only_where_actions_mean_what_it_was_taught(first: Path, tmp_path: Path, config: Config) -> None:

@@ -31,6 +31,16 @@ def test_weights_are_written_and_read(checkpoint: Path, tmp_path: Path, capsys: 
     assert b'"step":"3"' in out.read_bytes()[:4000], "what made the weights stands in the file"
 
 
+def test_a_run_folder_stands_for_the_weights_that_it_measured(checkpoint: Path, tmp_path: Path) -> None:
+    best, out = checkpoint.with_name("best.safetensors"), tmp_path / "flow.safetensors"
+    ArtFlowNet(neighbors=8, generator=torch.Generator().manual_seed(1)).save_pretrained(best)
+    assert main([str(checkpoint.parent), str(out)]) == 0
+    assert load_network(out).digest() == load_network(checkpoint).digest() != load_network(best).digest()
+    assert b'"step":"3"' in out.read_bytes()[:4000]
+    checkpoint.unlink()
+    assert load_network(checkpoint.parent).digest() == load_network(best).digest()
+
+
 def test_a_program_runs_with_pytorch_alone(checkpoint: Path, tmp_path: Path) -> None:
     assert main([str(checkpoint), str(tmp_path / "flow.pt2"), "--points", "40"]) == 0
     points, mask = torch.rand(3, 40, 3), torch.rand(3, 40) < 0.5
@@ -45,6 +55,7 @@ def test_a_program_runs_with_pytorch_alone(checkpoint: Path, tmp_path: Path) -> 
         (["RUN/checkpoint.pt", "flow.onnx"], ".pt2"),
         (["nowhere.pt", "flow.pt2"], "nowhere.pt"),
         (["nowhere.safetensors", "flow.pt2"], "nowhere.safetensors"),
+        (["run/..", "flow.safetensors"], "holds no weights"),
         (["RUN/checkpoint.pt", "flow.pt2", "--points", "3"], "16"),
     ],
 )
