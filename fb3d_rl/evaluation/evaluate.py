@@ -23,7 +23,7 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.drawing.picture import write_picture
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, predict
+from fb3d_rl.evaluation.flow import flow_rows, held_out_samples, measure_flow
 from fb3d_rl.evaluation.tables import DECISION, show, summary
 from fb3d_rl.files import replacing, write_text
 from fb3d_rl.flow.metrics import flow_metrics
@@ -261,8 +261,8 @@ def _measure_flow(
     net = copy.deepcopy(net).to(protocol.device)  # the policies' network stays on the CPU
     sets = held_out_samples(objects, protocol.samples, protocol.samples_per_object, protocol.seed)
     for target, (samples, about) in sets.items():
-        predicted = predict(net, samples, protocol.device)
-        rows = flow_rows(predicted, samples, about)
+        predicted, numbers = measure_flow(net, samples, protocol.device)
+        rows = flow_rows(numbers, about)
         if target == "part":
             measured = rows
             if protocol.clouds:

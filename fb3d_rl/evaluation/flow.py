@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,8 @@ from torch import nn
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
-from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.flow.metrics import flow_metrics, hypothesis_metrics
+from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.rollout.rows import FlowRow
 from fb3d_rl.scene.posed import Posed
 
@@ -59,19 +60,51 @@ def held_out_samples(
 @torch.no_grad()
 def predict(net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int = 32) -> torch.Tensor:
     """Predicted flow [S, N, 3] of samples [S], in the network's evaluation mode."""
+    return torch.cat([flow for flow, _, _ in _batches(net, samples, device, batch_size)])
+
+
+def _batches(
+    net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int
+) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Of each batch the predicted flow [B, N, 3], all proposals [B, K, N, 3] and their probabilities [B, K]."""
     training = net.training
     net.eval()
-    keys = (("observation", "points"), ("observation", "valid"), ("observation", "part_mask"))
-    parts = [net(*(batch[key].to(device) for key in keys)).cpu() for batch in samples.split(batch_size)]
+    for batch in samples.split(batch_size):
+        points, valid, mask = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
+        if isinstance(net, ArtFlowNet):
+            found = net.propose(points, valid, mask)
+            about = mask & valid if net.part_mask_input else valid
+            predicted = net.most_probable(found, valid, mask)
+            yield predicted.cpu(), found.flows.cpu(), found.of_clouds(about).cpu()
+        else:
+            flow = net(points, valid, mask).cpu()
+            yield flow, flow[:, None], torch.ones(len(flow), 1)
     net.train(training)
-    return torch.cat(parts)
+
+
+@torch.no_grad()
+def measure_flow(
+    net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int = 32
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Predicted flow [S, N, 3] of samples [S] and what it is worth, [S] each.
+
+    The numbers are those of :func:`~fb3d_rl.flow.metrics.flow_metrics` and
+    :func:`~fb3d_rl.flow.metrics.hypothesis_metrics`, nan for samples in which nothing visible moves.
+    """
+    flows, numbers = [], []
+    batches = zip(samples.split(batch_size), _batches(net, samples, device, batch_size), strict=True)
+    for batch, (flow, proposals, probabilities) in batches:
+        true, valid = batch["privileged", "flow"], batch["observation", "valid"]
+        further = hypothesis_metrics(proposals, probabilities, true, valid)
+        numbers.append(flow_metrics(flow, true, valid) | further)
+        flows.append(flow)
+    return torch.cat(flows), {key: torch.cat([part[key] for part in numbers]) for key in numbers[0]}
 
 
 def flow_rows(
-    predicted: torch.Tensor, samples: TensorDictBase, about: Sequence[tuple[ArticulatedObject, str, str]]
+    numbers: Mapping[str, torch.Tensor], about: Sequence[tuple[ArticulatedObject, str, str]]
 ) -> list[FlowRow]:
-    """One row per sample; samples in which nothing visible moves have none."""
-    numbers = flow_metrics(predicted, samples["privileged", "flow"], samples["observation", "valid"])
+    """One row for each sample's numbers of :func:`measure_flow`; samples in which nothing visible moves have none."""
     rows = []
     for i, (obj, split, link) in enumerate(about):
         values = {key: float(value[i]) for key, value in numbers.items()}

@@ -63,6 +63,13 @@ FLOW = (
     Metric("flow/rmse", "flow RMSE", "rmse", bounds=_POSITIVE),
     Metric("flow/magnitude_error", "flow magnitude error", "magn.", bounds=_POSITIVE),
 )
+AXIS = Metric("flow/axis_cosine", "flow |cosine|", "|cos.|", bounds=UNIT)
+"""Without the sense of the motion. Rows of earlier versions lack it, as they do those of :data:`PROPOSALS`."""
+PROPOSALS = (
+    Metric("flow/best_cosine", "flow cosine, best of all proposals", "best", bounds=(-1.0, 1.0)),
+    Metric("flow/probability", "probability of the prediction", "prob.", percent=True, bounds=UNIT),
+    Metric("flow/hit", "prediction is the best proposal", "hit", percent=True, bounds=UNIT),
+)
 CONTACT = Metric("contact_rate", "contact", "contact", percent=True, bounds=UNIT, share=True)
 SUCCESS = Metric("success_rate", "success", "success", percent=True, bounds=UNIT, share=True)
 MOTION_ONLY = Metric("motion_only_success_rate", "motion-only success", "motion", percent=True, bounds=UNIT, share=True)
@@ -83,6 +90,10 @@ _VALUES: dict[str, Callable[[Any], float | None]] = {
     "flow/cosine": lambda row: row.cosine,
     "flow/rmse": lambda row: row.rmse,
     "flow/magnitude_error": lambda row: row.magnitude_error,
+    "flow/axis_cosine": lambda row: row.axis_cosine if row.axis_cosine >= 0 else None,
+    "flow/best_cosine": lambda row: row.best_cosine if row.best_cosine >= -1 else None,
+    "flow/probability": lambda row: row.probability if row.probability >= 0 else None,
+    "flow/hit": lambda row: row.hit if row.hit >= 0 else None,
     "contact_rate": lambda row: float(row.contact),
     "success_rate": lambda row: float(row.success),
     "held_opened_rate": lambda row: float(row.held_opened) if row.mask == "none" else None,
@@ -158,7 +169,8 @@ def _measure(
 def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | None, classes: bool) -> dict[str, Any]:
     out: dict[str, Any] = {}
     if flow:
-        out |= _measure(flow, FLOW, "", classes)
+        recorded = any(row.axis_cosine >= 0 for row in flow)
+        out |= _measure(flow, FLOW + ((AXIS, *PROPOSALS) if recorded else ()), "", classes)
         out["flow/n"] = len(flow)
     for policy in policies(rows):
         of_policy = [row for row in rows if row.policy == policy]
@@ -293,8 +305,20 @@ def tables(numbers: Mapping[str, Any]) -> list[Table]:
     listed = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
     if unmasked(numbers):
         listed.append(unmasked_table(numbers, unmasked(numbers)))
+    if flow and numbers.get("flow/probability", 1.0) < 1.0:
+        listed.append(proposals_table(numbers))
     measured = effort_of(numbers, names)
     return [*listed, effort_table(numbers, measured)] if measured else listed
+
+
+def proposals_table(numbers: Mapping[str, Any]) -> Table:
+    """What the flows that a network proposes are worth: one row per metric, instance means with intervals."""
+    table = titled("Several proposed flows", ("",), ("mean", "95 % interval"))
+    for metric in (FLOW[0], AXIS, *PROPOSALS):
+        table.add_row(
+            metric.label, metric.show(numbers[metric.key]), metric.show_interval(numbers.get(f"{metric.key}_ci95"))
+        )
+    return table
 
 
 def _table(numbers: Mapping[str, Any], names: Sequence[str], flow: bool) -> Table:

@@ -122,6 +122,11 @@ class FlowRow:
         cosine: mean cosine between predicted and true flow.
         rmse: mean L2 norm of the error, in units of the largest true flow of the cloud.
         magnitude_error: mean absolute difference of the two norms, same unit.
+        axis_cosine: as ``cosine``, without the sense of the motion; -1 if it was not recorded, and so the next three
+            (:func:`fb3d_rl.flow.metrics.hypothesis_metrics`).
+        best_cosine: of the best of the proposed flows; -2 if it was not recorded, as -1 is a cosine.
+        probability: that the network gave to its prediction.
+        hit: 1 where the prediction was the best of the proposed flows, else 0.
 
     Raises:
         ValueError: a metric that is not finite.
@@ -134,6 +139,10 @@ class FlowRow:
     cosine: float
     rmse: float
     magnitude_error: float
+    axis_cosine: float = -1.0
+    best_cosine: float = -2.0
+    probability: float = -1.0
+    hit: float = -1.0
 
     def __post_init__(self) -> None:
         for name in ("cosine", "rmse", "magnitude_error"):

@@ -4,6 +4,7 @@ import io
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from rich.console import Console
 from scipy.stats import binomtest
 
 from fb3d_rl.evaluation.intervals import UNIT, means, wilson
-from fb3d_rl.evaluation.tables import number_rows, show, summary, trainings
+from fb3d_rl.evaluation.tables import number_rows, show, summary, tables, trainings
 from fb3d_rl.rollout.rows import FlowRow, TrialRow
 
 
@@ -254,3 +255,14 @@ def test_a_table_of_benchmarks_has_every_number() -> None:
 def test_rows_and_intervals_load_no_torch(module: str) -> None:
     code = f"import sys, {module}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_proposals_are_shown_where_a_network_has_several_and_older_rows_lack_them() -> None:
+    old = FlowRow("1", "Box", "test", "link_0", 0.5, 0.2, 0.1)
+    single = replace(old, axis_cosine=0.9, best_cosine=0.5, probability=1.0, hit=1.0)
+    several = replace(single, best_cosine=0.8, probability=0.6, hit=0.0)
+    assert "flow/axis_cosine" not in summary([], [old])
+    numbers = summary([], [several])
+    assert (numbers["flow/axis_cosine"], numbers["flow/best_cosine"], numbers["flow/hit"]) == (0.9, 0.8, 0.0)
+    titles = [[str(table.title) for table in tables(summary([], [row]))] for row in (old, single, several)]
+    assert titles[0] == titles[1] == titles[2][:-1] and titles[2][-1] == "Several proposed flows"
