@@ -243,6 +243,22 @@ def partnet_mobility() -> Lines:
     })  # fmt: skip
 
 
+def touch() -> Lines:
+    """The same weights with a policy that learns from its pulls and with one that does not."""
+    rows = [
+        Row("real, train_test and test", "real", "artflownet"),
+        Row("real, in none of UMPNet's lists", "extra", "artflownet"),
+        Row("procedural doors that look alike", "doors", "artflownet"),
+    ]
+    columns: dict[str, Cell] = {
+        "objects, trials": lambda row: "{n_objects}, {n}".format(**summary(f"touch/with/{row.folder}")),
+    }
+    for below, name in (("touch/without", "as predicted"), ("touch/with", "with touch")):
+        columns[name] = share("success_rate", below)
+        columns[f"{name}, class mean"] = share("success_rate_class_mean", below, interval=False)
+    return trials(rows, columns)
+
+
 def _flow_interval(numbers: dict[str, Any], key: str, decimals: int = 2) -> str:
     low, high = (plain(end, 2) for end in numbers[key + "_ci95"])
     return f"{plain(numbers[key], decimals)} ({low}–{high})"
@@ -324,7 +340,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     function.__name__: function
     for function in (
         headline, imitation, imitation_unseen, imitation_partnet_mobility, comparison, procedural, partnet_mobility,
-        flow_published, transfer, transfer_categories, pretrained,
+        flow_published, transfer, transfer_categories, pretrained, touch,
     )
 }  # fmt: skip
 

@@ -118,13 +118,18 @@ def choose_contact(
         clear = _clear(points, body, flow, scene, standoff, reachable, distance, options)
     good = _good(movable, surface.smooth, usual_free, free, fresh, reachable, clear)
 
-    far_enough = good & (distance >= options.min_distance)
-    near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
-    index = torch.where(good[rows, peak] | ~far_enough.any(-1), peak, near)
+    index = _peak_or_stand_in(good, peak, distance, options)
     found = movable.any(-1)[:, None]
     every = Contact(points, surface.direction, standoff, share[..., None], batch_size=points.shape[:1])
     chosen = every.at(index).apply(lambda x: torch.where(found, x, 0.0))
     return chosen, _first(every, good & found)
+
+
+def _peak_or_stand_in(good: Tensor, peak: Tensor, distance: Tensor, options: ContactOptions) -> Tensor:
+    """The peak [B], or the nearest good point [B, N] that is far enough from it if the peak is not good (I.E)."""
+    far_enough = good & (distance >= options.min_distance)
+    near = torch.where(far_enough, distance, torch.full_like(distance, torch.inf)).argmin(-1)
+    return torch.where(good.gather(1, peak[:, None]).squeeze(1) | ~far_enough.any(-1), peak, near)
 
 
 def best_candidate(candidates: Contact, hand: Tensor, axis: Tensor, options: ContactOptions) -> Contact:

@@ -153,7 +153,7 @@ class Observed:
     part: Tensor | None
     flow: Tensor
     camera: Tensor
-    pull: Tensor | None
+    pull: Tensor | None = None
 
     def __getitem__(self, rows: Tensor) -> Observed:
         """Some of the environments, by a mask [E] bool."""
