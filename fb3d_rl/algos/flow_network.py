@@ -33,10 +33,9 @@ from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.options import content, taken
-from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.options import FlowPolicyOptions
-from fb3d_rl.policies.touch import artflownet_policy
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.checkpoint import fitting, git_revision, save_checkpoint

@@ -35,9 +35,11 @@ from dataclasses import fields
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
 
 from fb3d_rl.geometry.transforms import alignment
+from fb3d_rl.models.artflownet import artflownet_module, reads_mask
 from fb3d_rl.policies.commands import above_ground, command
 from fb3d_rl.policies.contact import Contact, best_candidate
 from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
@@ -149,3 +151,24 @@ class FlowPolicy(Policy):
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:
     """The flow policy fed with the ground-truth flow: the upper bound, and the oracle of DAgger."""
     return FlowPolicy(("privileged", "flow"), limits, options)
+
+
+def artflownet_policy(
+    net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
+) -> TensorDictModule:
+    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form.
+
+    With ``options.learn`` the prediction is corrected by touch (:class:`~fb3d_rl.policies.touch.TouchPolicy`).
+
+    Raises:
+        UserError: the network reads the mask that the options keep from the policy.
+    """
+    from fb3d_rl.policies.touch import TouchPolicy  # imported late, as it holds a FlowPolicy
+
+    if options is not None and reads_mask(net):
+        options.require_mask("a network that was trained with the mask")
+    options = options or FlowPolicyOptions()
+    if not options.learn:
+        return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))
+    proposals = getattr(net, "hypotheses", 1) > 1
+    return TensorDictSequential(artflownet_module(net, proposals), TouchPolicy(limits, options, proposals))

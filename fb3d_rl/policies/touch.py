@@ -22,13 +22,11 @@ from dataclasses import fields
 
 import torch
 from tensordict import TensorClass, TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictSequential
-from torch import Tensor, nn
+from torch import Tensor
 
 from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.rigid_motion import local_weight, rigid_motion
 from fb3d_rl.geometry.transforms import dot, length, normalize, skew
-from fb3d_rl.models.artflownet import artflownet_module, reads_mask
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.flow_state import PULL
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis
@@ -293,20 +291,3 @@ def _velocity_at(arm: Tensor) -> Tensor:
     """The matrix [E, 3, 6] that takes a twist to the velocity of the body's point ``arm`` [E, 3] (m) off the origin."""
     eye = torch.eye(3, dtype=arm.dtype).expand(len(arm), 3, 3)
     return torch.cat([eye, -skew(arm)], -1)
-
-
-def artflownet_policy(
-    net: nn.Module, limits: VelocityLimits, options: FlowPolicyOptions | None = None
-) -> TensorDictModule:
-    """FlowBot3D: ArtFlowNet's prediction from the cloud, then the flow policy; so with any network of the same form.
-
-    Raises:
-        UserError: the network reads the mask that the options keep from the policy.
-    """
-    if options is not None and reads_mask(net):
-        options.require_mask("a network that was trained with the mask")
-    options = options or FlowPolicyOptions()
-    if not options.learn:
-        return TensorDictSequential(artflownet_module(net), FlowPolicy(FLOW, limits, options))
-    proposals = getattr(net, "hypotheses", 1) > 1
-    return TensorDictSequential(artflownet_module(net, proposals), TouchPolicy(limits, options, proposals))

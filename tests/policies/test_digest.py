@@ -13,11 +13,10 @@ from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.contact import ContactOptions
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, artflownet_policy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import Learner, LearnerOptions
-from fb3d_rl.policies.touch import artflownet_policy
 
 LIMITS = VelocityLimits(2.0, 3.0)
 OPTIONS = FlowPolicyOptions()

@@ -14,10 +14,9 @@ from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.geometry.transforms import euler_xyz_to_matrix, matrix_to_quaternion
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.commands import above_ground
-from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions, artflownet_policy, expert_policy
 from fb3d_rl.policies.flow_state import APPROACH, PULL, RELEASE, RETREAT, SELECT, TRAVEL, FlowState
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
-from fb3d_rl.policies.touch import artflownet_policy
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 DT = 0.05

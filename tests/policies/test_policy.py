@@ -12,13 +12,12 @@ from fb3d_rl.models.direction_net import DirectionNet
 from fb3d_rl.policies.baselines import RandomPolicy, normal_policy
 from fb3d_rl.policies.direction_policy import direction_policy
 from fb3d_rl.policies.ensemble import Ensemble
-from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.policies.gates import make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 from fb3d_rl.policies.learner import Learner, LearnerOptions
 from fb3d_rl.policies.policy import initial_state
-from fb3d_rl.policies.touch import artflownet_policy
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
 
