@@ -60,26 +60,28 @@ def held_out_samples(
 @torch.no_grad()
 def predict(net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int = 32) -> torch.Tensor:
     """Predicted flow [S, N, 3] of samples [S], in the network's evaluation mode."""
-    return torch.cat([flow for flow, _, _ in _batches(net, samples, device, batch_size)])
+    return torch.cat([flow for _, flow, _, _ in _batches(net, samples, device, batch_size)])
 
 
 def _batches(
     net: nn.Module, samples: TensorDictBase, device: torch.device, batch_size: int
-) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-    """Of each batch the predicted flow [B, N, 3], all proposals [B, K, N, 3] and their probabilities [B, K]."""
+) -> Iterator[tuple[TensorDictBase, torch.Tensor, torch.Tensor, torch.Tensor]]:
+    """Each batch with the predicted flow [B, N, 3], all proposals [B, K, N, 3] and their probabilities [B, K]."""
     training = net.training
     net.eval()
-    for batch in samples.split(batch_size):
-        points, valid, mask = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
-        if isinstance(net, ArtFlowNet):
-            found = net.propose(points, valid, mask)
-            about = mask & valid if net.part_mask_input else valid
-            predicted = net.most_probable(found, valid, mask)
-            yield predicted.cpu(), found.flows.cpu(), found.of_clouds(about).cpu()
-        else:
-            flow = net(points, valid, mask).cpu()
-            yield flow, flow[:, None], torch.ones(len(flow), 1)
-    net.train(training)
+    try:
+        for batch in samples.split(batch_size):
+            points, valid, mask = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
+            if isinstance(net, ArtFlowNet) and net.hypotheses > 1:
+                found = net.propose(points, valid, mask)
+                about = mask & valid if net.part_mask_input else valid
+                predicted = net.most_probable(found, valid, mask).cpu()
+                yield batch, predicted, found.flows.cpu(), found.of_clouds(about).cpu()
+            else:
+                flow = net(points, valid, mask).cpu()
+                yield batch, flow, flow[:, None], torch.ones(len(flow), 1)
+    finally:
+        net.train(training)
 
 
 @torch.no_grad()
@@ -92,10 +94,9 @@ def measure_flow(
     :func:`~fb3d_rl.flow.metrics.hypothesis_metrics`, nan for samples in which nothing visible moves.
     """
     flows, numbers = [], []
-    batches = zip(samples.split(batch_size), _batches(net, samples, device, batch_size), strict=True)
-    for batch, (flow, proposals, probabilities) in batches:
+    for batch, flow, proposals, probabilities in _batches(net, samples, device, batch_size):
         true, valid = batch["privileged", "flow"], batch["observation", "valid"]
-        further = hypothesis_metrics(proposals, probabilities, true, valid)
+        further = hypothesis_metrics(flow, proposals, probabilities, true, valid)
         numbers.append(flow_metrics(flow, true, valid) | further)
         flows.append(flow)
     return torch.cat(flows), {key: torch.cat([part[key] for part in numbers]) for key in numbers[0]}

@@ -39,26 +39,29 @@ def flow_metrics(predicted: Tensor, target: Tensor, valid: Tensor) -> dict[str, 
     }
 
 
-def hypothesis_metrics(flows: Tensor, probabilities: Tensor, target: Tensor, valid: Tensor) -> dict[str, Tensor]:
+def hypothesis_metrics(
+    predicted: Tensor, flows: Tensor, probabilities: Tensor, target: Tensor, valid: Tensor
+) -> dict[str, Tensor]:
     """What several proposed flows are worth, on the points that truly move.
 
     Args:
+        predicted: [B, N, 3] the prediction; it may take each point's flow from another proposal.
         flows: [B, K, N, 3] the proposals.
-        probabilities: [B, K] theirs; the largest is the prediction's.
+        probabilities: [B, K] theirs.
         target: [B, N, 3] the true flow.
         valid: [B, N] bool, False on padding.
 
     Returns:
         Four [B] tensors, nan for a cloud in which nothing moves: "axis_cosine", the mean absolute cosine of the
         prediction, which does not ask for the sense of the motion; "best_cosine", the mean cosine of the proposal with
-        the smallest "rmse" of all K; "probability" of the prediction; "hit", 1 where the prediction is that proposal,
-        else 0. Probabilities are calibrated where the means of the last two agree.
+        the smallest "rmse" of all K; "probability" of the most probable; "hit", 1 where that is the best one, else 0.
+        Probabilities are calibrated where the means of the last two agree.
     """
     each = [flow_metrics(flow, target, valid) for flow in flows.unbind(1)]
     rmse, cosine = (torch.stack([numbers[key] for numbers in each], 1) for key in ("rmse", "cosine"))
     best, chosen = rmse.argmin(1), probabilities.argmax(1)
     rows = torch.arange(len(flows))
-    predicted, moving = flows[rows, chosen], valid & (target.norm(dim=2) > MOVING_NORM)
+    moving = valid & (target.norm(dim=2) > MOVING_NORM)
     along = (functional.normalize(predicted, dim=2) * functional.normalize(target, dim=2)).sum(2).abs()
     nothing = torch.where(moving.any(1), 0.0, torch.nan)
     return {

@@ -82,7 +82,7 @@ class TouchOptions:
     free_after: float = option(0.03, "way of the part after which a slow pull becomes fast", "m", "[0, inf)")
     limit_stretch: float = option(
         0.03,
-        "stretch of the suction's spring at which a slow pull has met a limit, unless the part moved",
+        "stretch of the suction's spring at which a slow pull has met a limit, if the part moved less than half of it",
         "m",
         "(0, inf)",
     )
@@ -92,24 +92,34 @@ class TouchOptions:
     resistance: float = option(
         0.15, "share of its speed by which the hand lags behind where a fast pull becomes slow", within="[0, 1]"
     )
-    # Measured with the gripper and the suction of the simulated task: the lag is the force over the drives' damping.
-    stiffness: float = option(0.85, "lag of the hand for each metre of the spring's stretch", "1/s", "(0, inf)")
-    damping: float = option(0.19, "lag of the hand for each m/s at which the stretch grows", within="(0, inf)")
+    # Fitted to pulls in the simulated task with the default env.gripper and env.suction: effective values, which differ
+    # by direction by a factor of up to two. The lag grows with the spring's constants and falls with the drives'.
+    stiffness: float = option(
+        0.85,
+        "lag of the hand for each metre of the spring's stretch, for the default gripper and suction",
+        "1/s",
+        "(0, inf)",
+    )
+    damping: float = option(
+        0.19, "lag of the hand for each m/s at which the stretch grows, likewise", within="(0, inf)"
+    )
     ease_speed: float = option(0.1, "speed at which the hand backs off while it presses on the part", "m/s", "[0, inf)")
     slack_gain: float = option(2.0, "rate at which the tip gives way to stretch across the pull", "1/s", "[0, inf)")
     yield_gain: float = option(6.0, "rate at which it gives way to all stretch at resistance", "1/s", "[0, inf)")
     spacing: float = option(0.015, "way of the part between two measurements of its direction", "m", "(0, inf)")
-    precision: float = option(0.0002, "variance of a measured direction times the way that it is of", "m", "(0, inf)")
+    noise: float = option(0.0002, "variance of a measured direction times the way that it is of", "m", "(0, inf)")
     deviation: float = option(0.35, "standard deviation of the network's direction", within="(0, inf)")
     turn_deviation: float = option(1.0, "standard deviation of the network's turn", "rad/m", "(0, inf)")
     certainty: float = option(0.8, "probability of the network's sense of the motion", within="(0, 1)")
     at_once: float = option(0.05, "a limit that is met within this way is met at once", "m", "[0, inf)")
-    against_at_once: float = option(4.0, "log-odds against a direction in which a limit is met at once")
-    against: float = option(1.5, "log-odds against a direction in which a limit is met later")
+    against_at_once: float = option(
+        4.0, "log-odds against a direction in which a limit is met at once", within="[0, inf)"
+    )
+    against: float = option(1.5, "log-odds against a direction in which a limit is met later", within="[0, inf)")
     convincing: float = option(
         0.15, "way of the part that counts 1 for its direction in log-odds, at most 4", "m", "(0, inf)"
     )
-    keeps: float = option(5.0, "log-odds for the direction of a pull that goes on")
+    keeps: float = option(5.0, "log-odds for the direction of a pull, until it meets a limit", within="[0, inf)")
 
 
 @dataclass(frozen=True)
@@ -190,7 +200,7 @@ class FlowPolicyOptions:
         "m",
         "[0, inf)",
     )
-    learn: bool = option(True, "whether a predicted flow is corrected by what is felt while pulling")
+    learn: bool = option(True, "whether the flow that a network predicts is corrected by what is felt while pulling")
     touch: TouchOptions = group(TouchOptions)
     mask: Literal["target", "none"] = "target"
     contact: ContactOptions = ContactOptions()

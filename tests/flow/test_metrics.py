@@ -42,7 +42,8 @@ def test_of_several_proposals_the_most_probable_is_the_prediction_and_the_neares
     other_sense, across, right = (torch.tensor([way, [9.0, 9, 9]]) for way in ([-1.0, 0, 0], [0.0, 1, 0], [0.9, 0, 0]))
     flows = torch.stack([other_sense, across, right]).expand(3, 3, 2, 3)
     probabilities = torch.tensor([[0.7, 0.2, 0.1], [0.1, 0.2, 0.7], [1.0, 0.0, 0.0]])
-    found = hypothesis_metrics(flows, probabilities, target, torch.ones(3, 2, dtype=torch.bool))
+    predicted = torch.stack([other_sense, right, right])
+    found = hypothesis_metrics(predicted, flows, probabilities, target, torch.ones(3, 2, dtype=torch.bool))
     assert found["axis_cosine"][:2].tolist() == [1.0, 1.0], "the sense does not count"
     assert found["best_cosine"][:2].tolist() == pytest.approx([1.0, 1.0])
     assert found["probability"][:2].tolist() == pytest.approx([0.7, 0.7])
