@@ -46,6 +46,9 @@ FOLLOWS = 0.5
 MOVES = 0.05
 """Without a mask, size of the predicted flow above which a point moves."""
 
+TEARS_EARLY = 0.1
+"""A hold that is lost within this way of the tip (m) did not move the part."""
+
 MOST_GAINED = 4.0
 """Log-odds for a direction that one pull gains at most."""
 
@@ -206,7 +209,10 @@ class TouchPolicy(Policy):
         stops |= pressed & (way < o.still * wanted * period) & (state.tested < o.at_once)
         blocked = goes_on & slow & stops & (state.limits == 0)
         resisted = goes_on & ~slow & ~pressed & (dot(lag, direction) > o.resistance * wanted)
-        torn = lost & (state.limits == 0) & (strained > 0.5 * o.limit_stretch)
+        # A spring that tears so soon was stretched by nearly all of the tip's way: the part did not follow.
+        early = lost & (state.moved + strained < TEARS_EARLY)
+        state.moved = torch.where(early, 0.0, state.moved)
+        torn = lost & (state.limits == 0) & (early | (strained > 0.5 * o.limit_stretch))
         along = (_velocity_at(point - state.origin).mT @ direction[..., None]).squeeze(-1)
         known = (along * state.evidence).sum(-1, keepdim=True)
         # Where the part has moved this way before, the limit is one at the end of a way.
