@@ -20,6 +20,7 @@ from fb3d_rl.algos.weights import BEST, CHECKPOINT, load_network
 from fb3d_rl.data.generate import load_samples
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate
+from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.registry import REGISTRY, trained
 from fb3d_rl.training.checkpoint import load_checkpoint, save_checkpoint
@@ -165,11 +166,14 @@ def test_the_flow_is_measured_on_the_device(
     """Torch's device without memory stands for a GPU; what runs there gives no numbers."""
     seen = []
 
-    def predicts(net: torch.nn.Module, samples: Any, device: torch.device) -> torch.Tensor:
+    def measured(
+        net: torch.nn.Module, samples: Any, device: torch.device
+    ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         seen.append((device, {value.device for value in net.parameters()}))
-        return samples["privileged", "flow"]
+        flow = samples["privileged", "flow"]
+        return flow, flow_metrics(flow, flow, samples["observation", "valid"])
 
-    monkeypatch.setattr(evaluate, "predict", predicts)
+    monkeypatch.setattr(evaluate, "measure_flow", measured)
     monkeypatch.setattr(setup, "choose_device", lambda name: torch.device("meta" if name == "cuda" else "cpu"))
     given = [
         "policy=artflownet",
