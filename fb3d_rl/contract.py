@@ -5,7 +5,7 @@ vectors). Quaternions are wxyz, unit, w >= 0. Leading dims: env ``[E]``, rollout
 N is the number of points of a cloud (1200 unless configured otherwise).
 
 What a policy carries from step to step is its own affair: it declares it (:mod:`fb3d_rl.policies.policy`), the flow
-policy under "policy" (:class:`fb3d_rl.policies.flow_state.FlowState`), what it has felt under "touch"
+policy under "policy" (:class:`fb3d_rl.policies.flow_state.FlowState`), what its pulls have taught under "touch"
 (:class:`fb3d_rl.policies.touch.TouchState`).
 """
 

@@ -15,7 +15,7 @@ FLOW = ("privileged", "flow")
 
 
 @dataclass(frozen=True)
-class Told:
+class Access:
     """Inputs of a policy beyond points and proprioception.
 
     Attributes:
@@ -34,7 +34,7 @@ class Entry:
     """A policy, and its training if it has one; code is named as "module:object".
 
     Attributes:
-        told: the policy's inputs, by the ending of its name in tables.
+        access: the policy's inputs, by the ending of its name in tables.
         act: ``act(limits, flow policy's options)`` makes a policy that is not trained.
         algorithm: a :class:`fb3d_rl.algos.algorithm.Algorithm`, which trains it and loads its checkpoints.
         options: the dataclass of the keys of ``algo`` (:class:`fb3d_rl.algos.options.AlgoOptions`).
@@ -42,7 +42,7 @@ class Entry:
         joint_fit: whether several processes can fit it together.
     """
 
-    told: Mapping[str, Told]
+    access: Mapping[str, Access]
     act: str = ""
     algorithm: str = ""
     options: str = ""
@@ -57,18 +57,18 @@ class Entry:
     @property
     def maskless(self) -> bool:
         """Whether it can act without the mask of the part to open."""
-        return not all(told.mask for told in self.told.values())
+        return not all(access.mask for access in self.access.values())
 
 
-NOTHING = Told("nothing")
+NOTHING = Access("nothing")
 WITHOUT_MASK = ", policy.mask=none"
 EXPERT = "the true flow of the part to open"
 IMITATION = Entry(
     {
         "": NOTHING,
-        "_flow": Told("the true flow, which is an input of the network", truth=(FLOW,)),
-        "_oracle": Told("the expert drives it to the contact point, by the true flow", truth=(FLOW,)),
-        "_oracle_flow": Told("both: the expert's drive and the true flow", truth=(FLOW,)),
+        "_flow": Access("the true flow, which is an input of the network", truth=(FLOW,)),
+        "_oracle": Access("the expert drives it to the contact point, by the true flow", truth=(FLOW,)),
+        "_oracle_flow": Access("both: the expert's drive and the true flow", truth=(FLOW,)),
     },
     algorithm="fb3d_rl.algos.dagger:ALGORITHM",
     options="fb3d_rl.algos.options:ImitationOptions",
@@ -78,11 +78,11 @@ FITTED = "fb3d_rl.algos.options:FlowNetworkOptions"
 
 REGISTRY = {
     "expert": Entry(
-        {"": Told(EXPERT, truth=(FLOW,)), WITHOUT_MASK: Told(EXPERT, mask=False, truth=(FLOW,))},
+        {"": Access(EXPERT, truth=(FLOW,)), WITHOUT_MASK: Access(EXPERT, mask=False, truth=(FLOW,))},
         act="fb3d_rl.policies.flow_policy:expert_policy",
     ),
     "artflownet": Entry(
-        {"": NOTHING, WITHOUT_MASK: Told("nothing", mask=False)},
+        {"": NOTHING, WITHOUT_MASK: Access("nothing", mask=False)},
         algorithm="fb3d_rl.algos.artflownet:ALGORITHM",
         options=FITTED,
         joint_fit=True,
@@ -90,7 +90,7 @@ REGISTRY = {
     "screwnet": Entry({"": NOTHING}, algorithm="fb3d_rl.algos.screwnet:ALGORITHM", options=FITTED),
     "ump_di": Entry(
         {
-            "": Told(
+            "": Access(
                 "until it holds the part, the size of the true flow at each point, not its direction", truth=(FLOW,)
             )
         },
@@ -99,7 +99,7 @@ REGISTRY = {
     ),
     "normal": Entry({"": NOTHING}, act="fb3d_rl.policies.baselines:normal_policy"),
     "random": Entry(
-        {"": Told("nothing, and it sees nothing", mask=False)}, act="fb3d_rl.policies.baselines:random_policy"
+        {"": Access("nothing, and it sees nothing", mask=False)}, act="fb3d_rl.policies.baselines:random_policy"
     ),
     "bc": IMITATION,
     "dagger": IMITATION,
@@ -122,23 +122,23 @@ def untrained() -> tuple[str, ...]:
     return tuple(name for name, entry in REGISTRY.items() if not entry.trained)
 
 
-def truths() -> dict[str, Told]:
+def truths() -> dict[str, Access]:
     """The inputs of each policy, by the names in tables of the policies that share them.
 
     Gates act in training only and are not part of it.
     """
     named: dict[tuple[int, str], list[str]] = {}
     for name, entry in REGISTRY.items():
-        for ending in entry.told:
+        for ending in entry.access:
             named.setdefault((id(entry), ending), []).append(name)
     return {
-        ", ".join(name + ending for name in names): REGISTRY[names[0]].told[ending]
+        ", ".join(name + ending for name in names): REGISTRY[names[0]].access[ending]
         for (_, ending), names in named.items()
     }
 
 
 def truths_table() -> str:
     """:func:`truths` as a table in Markdown."""
-    rows = [("policy", "the part's mask", "what it is told besides"), ("---",) * 3]
-    rows += [(name, "yes" if told.mask else "no", told.words) for name, told in truths().items()]
+    rows = [("policy", "the part's mask", "privileged input"), ("---",) * 3]
+    rows += [(name, "yes" if access.mask else "no", access.words) for name, access in truths().items()]
     return "\n".join(f"| {' | '.join(row)} |" for row in rows)

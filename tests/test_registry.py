@@ -1,4 +1,4 @@
-"""Every policy and algorithm is there in full, and is told what is declared and nothing else."""
+"""Every policy and algorithm is there in full, and reads what is declared and nothing else."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MASKED, MASKLESS = FlowPolicyOptions(), FlowPolicyOptions(mask="none")
 
 
 KINDS = [name for name, entry in REGISTRY.items() if entry.options == REGISTRY["artflownet"].options]
-TOLD = truths()
+ACCESS = truths()
 
 
 def trained(name: str, options: FlowPolicyOptions, part_mask_input: bool = True) -> TensorDictModuleBase:
@@ -50,7 +50,7 @@ POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
         name + ending: partial(untrained, name, MASKLESS if ending == WITHOUT_MASK else MASKED)
         for name, entry in REGISTRY.items()
         if not entry.trained
-        for ending in entry.told
+        for ending in entry.access
     },
     "artflownet": lambda: trained("artflownet", MASKED),
     "artflownet, policy.mask=none": lambda: trained("artflownet", MASKLESS, part_mask_input=False),
@@ -63,16 +63,16 @@ POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
 }
 
 
-@pytest.mark.parametrize("name", TOLD)
+@pytest.mark.parametrize("name", ACCESS)
 def test_a_policy_reads_what_is_declared(name: str) -> None:
-    policy, told = POLICIES[name](), TOLD[name]
-    assert {key for key in policy.in_keys if key[0] == "privileged"} == set(told.truth)
-    assert (MASK in policy.in_keys) == told.mask
-    assert mask_of(policy) == ("target" if told.mask else "" if name == "random" else "none")
+    policy, access = POLICIES[name](), ACCESS[name]
+    assert {key for key in policy.in_keys if key[0] == "privileged"} == set(access.truth)
+    assert (MASK in policy.in_keys) == access.mask
+    assert mask_of(policy) == ("target" if access.mask else "" if name == "random" else "none")
 
 
 def test_no_policy_is_missing_and_the_documents_say_the_same() -> None:
-    assert set(POLICIES) == set(TOLD)
+    assert set(POLICIES) == set(ACCESS)
     assert truths_table() in (ROOT / "docs" / "protocols.md").read_text()
 
 
@@ -95,7 +95,7 @@ def test_an_entry_is_complete(name: str) -> None:
     assert (ROOT / "conf" / "policy" / f"{name}.yaml").is_file()
     assert (ROOT / "conf" / "algo" / f"{name}.yaml").is_file() == entry.trained
     assert bool(entry.act) != entry.trained == bool(entry.options)
-    assert entry.told
+    assert entry.access
     if entry.trained:
         algorithm = behind(entry.algorithm)
         assert callable(algorithm.train) and callable(algorithm.load)

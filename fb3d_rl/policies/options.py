@@ -200,7 +200,7 @@ class FlowPolicyOptions:
         "m",
         "[0, inf)",
     )
-    learn: bool = option(True, "whether the flow that a network predicts is corrected by what is felt while pulling")
+    learn: bool = option(True, "whether the flow that a network predicts is corrected by what its pulls measure")
     touch: TouchOptions = group(TouchOptions)
     mask: Literal["target", "none"] = "target"
     contact: ContactOptions = ContactOptions()
@@ -261,7 +261,9 @@ class LearnerOptions:
         256, "number of points of a cloud that the learner reads; clouds are in random order", within="[16, inf)"
     )
     width: int = option(64, "of the network's layers", within="[4, inf)")
-    history: int = option(3, "steps before the present one whose feelings it remembers", "control steps", "[0, inf)")
+    history: int = option(
+        3, "steps before the present one whose proprioception and contact it remembers", "control steps", "[0, inf)"
+    )
     chunk: int = option(1, "how far it plans ahead ...", "control steps", "[1, inf)")
     execute: int = option(1, "... of which this many are executed before the next plan", "control steps", "[1, inf)")
     discrepancy: bool = False

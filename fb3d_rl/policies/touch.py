@@ -92,7 +92,7 @@ class TouchState(TensorClass):
 
     @classmethod
     def initial(cls, batch: Sequence[int]) -> TouchState:
-        """Nothing was felt: all zeros."""
+        """Nothing is known: all zeros."""
         sizes = {"information": (6, 6), "moment": (6,), "evidence": (6,), "moved": (1,), "limits": (1,), "tested": (1,)}
         names = [field.name for field in fields(cls)]
         state = {name: torch.zeros(*batch, *sizes.get(name, (3,))) for name in names}
@@ -104,8 +104,8 @@ class TouchPolicy(Policy):
 
     Shapes: reads what :class:`~fb3d_rl.policies.flow_policy.FlowPolicy` reads, the slides' velocities ("observation",
     "qvel") and, if the network proposes K flows, ("prediction", "flows") [E, K, N, 3] and ("prediction",
-    "log_probabilities") [E, K, N]. Overwrites ("prediction", "flow") where something was felt; writes what the flow
-    policy writes, the tip's velocity in a pull ("prediction", "pull_velocity") [E, 3] (m/s), and the next step's
+    "log_probabilities") [E, K, N]. Overwrites ("prediction", "flow") where pulls have taught something; writes what the
+    flow policy writes, the tip's velocity in a pull ("prediction", "pull_velocity") [E, 3] (m/s), and the next step's
     :class:`TouchState` under ("next", "touch").
 
     Args:
@@ -124,7 +124,7 @@ class TouchPolicy(Policy):
         self.out_keys = [FLOW, VELOCITY, *self.flow_policy.out_keys, *(("next", *key) for key in state)]
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
-        """The flow policy's state and {"touch": ...}: nothing was felt."""
+        """The flow policy's state and {"touch": ...}: nothing is known."""
         touch = TensorDict({"touch": TouchState.initial(batch).to_tensordict()}, batch_size=batch)
         return self.flow_policy.initial_state(batch).update(touch)
 
@@ -136,12 +136,12 @@ class TouchPolicy(Policy):
         assert isinstance(state, TouchState)
         held = obs["attached"]
         pulled = (tensordict["policy", "phase"] == PULL) & (state.asked != 0).any(-1, keepdim=True)
-        state, blocked, halted = self._feel(state, obs, held, pulled)
+        state, blocked, halted = self._update(state, obs, held, pulled)
         asked = velocity = torch.zeros_like(state.tip)
-        felt = held | state.information.flatten(1).any(1, keepdim=True) | state.evidence.any(-1, keepdim=True)
-        if bool(felt.any()):
+        known = held | state.information.flatten(1).any(1, keepdim=True) | state.evidence.any(-1, keepdim=True)
+        if bool(known.any()):
             flow, twist, direction = self._believe(tensordict, state, held, pulled, blocked)
-            tensordict[FLOW] = torch.where(felt[..., None], flow, tensordict[FLOW])
+            tensordict[FLOW] = torch.where(known[..., None], flow, tensordict[FLOW])
             turns = pulled & held & (dot(direction, normalize(state.asked)) < TURNED)
             self._conclude(state, turns)
             state.moved, state.limits = (torch.where(turns, 0.0, x) for x in (state.moved, state.limits))
@@ -180,7 +180,7 @@ class TouchPolicy(Policy):
         )
         return asked, speed * normalize(direction + ahead) - yields + off
 
-    def _feel(
+    def _update(
         self, state: TouchState, obs: TensorDictBase, held: Tensor, pulled: Tensor
     ) -> tuple[TouchState, Tensor, Tensor]:
         """The state after the last step; where the pull met a limit, and where it met that or resistance [E, 1]."""

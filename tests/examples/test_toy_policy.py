@@ -14,7 +14,7 @@ from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 from fb3d_rl.policies.policy import Policy
-from fb3d_rl.registry import REGISTRY, Entry, Told
+from fb3d_rl.registry import REGISTRY, Access, Entry
 from fb3d_rl.rollout.rows import read_trials
 
 LIMITS = VelocityLimits(linear=2.0, angular=3.0)
@@ -70,7 +70,7 @@ def test_it_goes_to_the_nearest_valid_point_of_the_part_and_back_once_it_holds_i
 def test_it_is_evaluated_by_its_name(
     tmp_path: Path, config: Callable[[str, list[str]], Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(REGISTRY, "touch_and_pull", Entry({"": Told("nothing")}, act=f"{__name__}:make"))
+    monkeypatch.setitem(REGISTRY, "touch_and_pull", Entry({"": Access("nothing")}, act=f"{__name__}:make"))
     words = ["experiment=smoke", "assets.categories=[StorageFurniture]", "policy.name=touch_and_pull"]
     words += ["evaluation.trials=1", "evaluation.expert=false"]
     words += ["data.points=128", "camera.resolution=32", "env.horizon=60"]

@@ -139,7 +139,7 @@ def turned(degrees: float) -> Tensor:
 
 
 def test_the_screw_is_measured_where_the_network_errs() -> None:
-    """The flow is 35 degrees off; what was felt corrects it to a few, and the pull holds."""
+    """The flow is 35 degrees off; what the pull measures corrects it to a few, and the pull holds."""
     door, policy = SpringDoor(sliding=True, limit=0.6), touch()
     assert opens(door, policy, turned(35.0), until=0.5) < 100
     assert door.lost == 0
@@ -168,7 +168,7 @@ def test_the_next_hypothesis_is_tried_where_the_first_meets_a_limit() -> None:
     assert opens(door, TouchPolicy(LIMITS, OPTIONS, True), across, 1.0, until=0.5) < 120
 
 
-def test_nothing_is_changed_before_something_was_felt_even_beside_a_door_that_is_held() -> None:
+def test_nothing_is_changed_before_something_is_known_even_beside_a_door_that_is_held() -> None:
     """Without a mask the prediction takes each point's flow from another proposal, which a correction would not."""
     policy = TouchPolicy(LIMITS, replace(OPTIONS, mask="none"), proposals=True)
     flows, held = (1.0, -1.0), SpringDoor()
@@ -252,7 +252,7 @@ def test_a_second_hold_at_another_radius_agrees_with_the_first() -> None:
         assert float(way @ true) > math.cos(math.radians(3.0))
 
 
-def test_what_one_environment_feels_does_not_reach_another() -> None:
+def test_what_one_environment_knows_does_not_reach_another() -> None:
     policy = touch()
     doors, states, alone = [SpringDoor(True, 0.6), SpringDoor(False)], [], []
     for door, flow in zip(doors, (-1.0, 1.0), strict=True):
