@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -36,13 +37,14 @@ class SpringDoor(ToyDoor):
 
     def __init__(self, sliding: bool = False, limit: float = 1.6, spring: float = 1.0) -> None:
         super().__init__(sliding)
-        self.limit, self.spring, self.lost, self.farthest = limit, spring, 0, 0.0
+        self.limit, self.spring, self.sense, self.lost, self.farthest = limit, spring, 1.0, 0, 0.0
         self.qvel = torch.zeros(1, 8)
 
     def observe(self, state: TensorDict) -> TensorDict:
         td = super().observe(state["policy"])
         td.update(state.exclude("policy"))
         td["observation", "qvel"] = self.qvel
+        td["observation", "goal_sense"] = torch.full((1, 1), self.sense)
         return td
 
     def step(self, action: Tensor) -> None:
@@ -79,15 +81,26 @@ class SpringDoor(ToyDoor):
         return min(max(free, 0.0), self.limit)
 
 
-def opens(
-    door: SpringDoor, policy: FlowPolicy | TouchPolicy, *flows: Tensor | float, until: float, steps: int = 150
-) -> int:
-    """Control steps until the door is open; a flow that is a number is so many times the true one."""
+def pulls(
+    door: SpringDoor, policy: FlowPolicy | TouchPolicy, *flows: Tensor | float, steps: int = 150
+) -> Iterator[TensorDict]:
+    """The TensorDict of each control step, after the door has moved; its "next" is the state of the following one.
+
+    A flow that is a number is so many times the true one.
+    """
     state = policy.initial_state(torch.Size([1]))
-    for step in range(steps):
+    for _ in range(steps):
         td = policy(predicted(door, state, flows))
         state = td["next"].select(*state.keys())
         door.step(td["action"])
+        yield td
+
+
+def opens(
+    door: SpringDoor, policy: FlowPolicy | TouchPolicy, *flows: Tensor | float, until: float, steps: int = 150
+) -> int:
+    """Control steps until the door is open."""
+    for step, _ in enumerate(pulls(door, policy, *flows, steps=steps)):
         if door.opened >= until:
             return step
     return steps
@@ -143,13 +156,8 @@ def test_the_screw_is_measured_where_the_network_errs() -> None:
     door, policy = SpringDoor(sliding=True, limit=0.6), touch()
     assert opens(door, policy, turned(35.0), until=0.5) < 100
     assert door.lost == 0
-    state, door = policy.initial_state(torch.Size([1])), SpringDoor(sliding=True, limit=0.6)
-    for _ in range(60):
-        td = policy(predicted(door, state, (turned(35.0),)))
-        state = td["next"].select("policy", "touch")
-        door.step(td["action"])
-        if door.opened > 0.3:
-            break
+    door = SpringDoor(sliding=True, limit=0.6)
+    td = next(td for td in pulls(door, policy, turned(35.0), steps=60) if door.opened > 0.3)
     way = normalize(td["prediction", "flow"][0].mean(0))
     assert float(way @ torch.tensor([-1.0, 0.0, 0.0])) > math.cos(math.radians(8.0))
 
@@ -172,11 +180,7 @@ def test_nothing_is_changed_before_something_is_known_even_beside_a_door_that_is
     """Without a mask the prediction takes each point's flow from another proposal, which a correction would not."""
     policy = TouchPolicy(LIMITS, replace(OPTIONS, mask="none"), proposals=True)
     flows, held = (1.0, -1.0), SpringDoor()
-    state = policy.initial_state(torch.Size([1]))
-    while held.held is None:
-        td = policy(predicted(held, state, flows))
-        state = td["next"].select("policy", "touch")
-        held.step(td["action"])
+    state = next(td["next"] for td in pulls(held, policy, *flows) if held.held is not None)
     fresh = predicted(SpringDoor(), policy.initial_state(torch.Size([1])), flows)
     fresh["prediction", "flow"] = torch.where(torch.arange(400)[None, :, None] % 2 == 0, 1.0, -1.0) * fresh[FLOW]
     both = policy(torch.cat([predicted(held, state, flows), fresh.clone()]))
@@ -201,13 +205,9 @@ def test_what_a_pull_has_moved_counts_after_it_was_let_go() -> None:
 
 
 def test_a_part_that_gives_way_after_all_is_pulled_on_without_retries() -> None:
-    door, policy = SpringDoor(sliding=True, limit=0.3), touch(retries=0)
-    state = policy.initial_state(torch.Size([1]))
-    for _ in range(150):
-        td = policy(predicted(door, state, (1.0,)))
-        state = td["next"].select("policy", "touch")
-        door.step(td["action"])
-        if bool(state["touch", "limits"].any()):
+    door = SpringDoor(sliding=True, limit=0.3)
+    for td in pulls(door, touch(retries=0), 1.0):
+        if bool(td["next", "touch", "limits"].any()):
             door.limit = 0.9  # what was in the way is gone
     assert door.opened > 0.6
 
@@ -219,17 +219,8 @@ def test_a_limit_is_found_where_all_pulls_are_slow() -> None:
 
 def test_closing_follows_the_flow_backwards() -> None:
     door = SpringDoor(sliding=True, limit=0.6)
-    policy, state = touch(), touch().initial_state(torch.Size([1]))
-    door.opened = 0.4
-    for _ in range(120):
-        td = predicted(door, state, (1.0,))
-        td["observation", "goal_sense"] = -torch.ones(1, 1)
-        td = policy(td)
-        state = td["next"].select("policy", "touch")
-        door.step(td["action"])
-        if door.opened < 0.05:
-            return
-    raise AssertionError(f"the drawer is still {door.opened} m open")
+    door.opened, door.sense = 0.4, -1.0
+    assert any(door.opened < 0.05 for _ in pulls(door, touch(), 1.0, steps=120)), f"it is still {door.opened} m open"
 
 
 def test_a_second_hold_at_another_radius_agrees_with_the_first() -> None:
@@ -256,12 +247,8 @@ def test_what_one_environment_knows_does_not_reach_another() -> None:
     policy = touch()
     doors, states, alone = [SpringDoor(True, 0.6), SpringDoor(False)], [], []
     for door, flow in zip(doors, (-1.0, 1.0), strict=True):
-        state = policy.initial_state(torch.Size([1]))
-        for _ in range(35):
-            td = policy(predicted(door, state, (flow,)))
-            state = td["next"].select("policy", "touch")
-            door.step(td["action"])
-        states.append(predicted(door, state, (flow,)))
+        *_, last = pulls(door, policy, flow, steps=35)
+        states.append(predicted(door, last["next"], (flow,)))
         alone.append(policy(states[-1].clone()))
     together = policy(torch.cat(states))
     assert int(together["policy", "phase"][0]) == PULL
