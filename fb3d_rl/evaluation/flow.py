@@ -15,7 +15,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
 from fb3d_rl.flow.metrics import flow_metrics, hypothesis_metrics
-from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.artflownet import proposes_several
 from fb3d_rl.rollout.rows import FlowRow
 from fb3d_rl.scene.posed import Posed
 
@@ -72,7 +72,7 @@ def _batches(
     try:
         for batch in samples.split(batch_size):
             points, valid, mask = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
-            if isinstance(net, ArtFlowNet) and net.hypotheses > 1:
+            if proposes_several(net):
                 found = net.propose(points, valid, mask)
                 about = mask & valid if net.part_mask_input else valid
                 predicted = net.most_probable(found, valid, mask).cpu()

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import NamedTuple, TypeVar, cast
+from typing import NamedTuple, TypeGuard, TypeVar
 
 import numpy as np
 import torch
@@ -218,18 +218,24 @@ def reads_mask(net: nn.Module) -> bool:
     return bool(getattr(net, "part_mask_input", True))
 
 
+def proposes_several(net: nn.Module) -> TypeGuard[ArtFlowNet]:
+    """Whether a network proposes several flows for each cloud."""
+    return isinstance(net, ArtFlowNet) and net.hypotheses > 1
+
+
 def artflownet_module(net: nn.Module, proposals: bool = False) -> TensorDictModule:
     """Read the observation's points, valid and, if the network was trained with it, part_mask; write ("prediction",
     "flow"), what the network answers; of several hypotheses the most probable.
 
     Args:
         net: the network.
-        proposals: whether all hypotheses are written, too: ("prediction", "flows") [B, K, N, 3] and ("prediction",
-            "log_probabilities") [B, K, N].
+        proposals: whether all hypotheses are written, too, if there are several: ("prediction", "flows") [B, K, N, 3]
+            and ("prediction", "log_probabilities") [B, K, N].
     """
     keys = [("observation", key) for key in ("points", "valid", *(["part_mask"] if reads_mask(net) else []))]
-    names = ["flow", "flows", "log_probabilities"] if proposals else ["flow"]
-    module = _Proposals(cast("ArtFlowNet", net)) if proposals else net
+    module, names = net, ["flow"]
+    if proposals and proposes_several(net):
+        module, names = _Proposals(net), ["flow", "flows", "log_probabilities"]
     return TensorDictModule(module, in_keys=keys, out_keys=[("prediction", name) for name in names])
 
 

@@ -39,7 +39,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from fb3d_rl.geometry.transforms import alignment
-from fb3d_rl.models.artflownet import artflownet_module, reads_mask
+from fb3d_rl.models.artflownet import artflownet_module, proposes_several, reads_mask
 from fb3d_rl.policies.commands import above_ground, command
 from fb3d_rl.policies.contact import Contact, best_candidate
 from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
@@ -170,5 +170,5 @@ def artflownet_policy(
     options = options or FlowPolicyOptions()
     if not options.learn:
         return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))
-    proposals = getattr(net, "hypotheses", 1) > 1
-    return TensorDictSequential(artflownet_module(net, proposals), TouchPolicy(limits, options, proposals))
+    touch = TouchPolicy(limits, options, proposes_several(net))
+    return TensorDictSequential(artflownet_module(net, proposals=True), touch)

@@ -173,12 +173,9 @@ class TouchPolicy(Policy):
         yields = torch.where(
             halted, min(o.yield_gain, all_of_it) * state.stretch, min(o.slack_gain, all_of_it) * across
         )
-        pressed = obs["contact_force"] > options.force
-        off = (
-            torch.where(pressed & (speed < options.pull_speed), o.ease_speed, 0.0)
-            * hand_axis(obs["tool_pose"]).double()
-        )
-        return asked, speed * normalize(direction + ahead) - yields + off
+        presses = (obs["contact_force"] > options.force) & (speed < options.pull_speed)
+        backs_off = torch.where(presses, o.ease_speed, 0.0) * hand_axis(obs["tool_pose"]).double()
+        return asked, speed * normalize(direction + ahead) - yields + backs_off
 
     def _update(
         self, state: TouchState, obs: TensorDictBase, held: Tensor, pulled: Tensor
@@ -213,7 +210,7 @@ class TouchPolicy(Policy):
         early = lost & (state.moved + strained < TEARS_EARLY)
         state.moved = torch.where(early, 0.0, state.moved)
         torn = lost & (state.limits == 0) & (early | (strained > 0.5 * o.limit_stretch))
-        along = (_velocity_at(point - state.origin).mT @ direction[..., None]).squeeze(-1)
+        along = _along(state)
         known = (along * state.evidence).sum(-1, keepdim=True)
         # Where the part has moved this way before, the limit is one at the end of a way.
         at_once = (state.moved < o.at_once) & (known <= 0)
@@ -263,8 +260,7 @@ class TouchPolicy(Policy):
     def _conclude(self, state: TouchState, where: Tensor) -> None:
         """Count the way that the part has gone for its direction, where the pull in it has ended [E, 1]."""
         gained = torch.where(where, self._gained(state), 0.0)
-        along = _velocity_at(state.tip - state.stretch - state.origin).mT @ normalize(state.asked)[..., None]
-        state.evidence = state.evidence + gained * along.squeeze(-1)
+        state.evidence = state.evidence + gained * _along(state)
 
     def _gained(self, state: TouchState) -> Tensor:
         return (state.moved / self.options.touch.convincing).clamp(0.0, MOST_GAINED)
@@ -279,11 +275,14 @@ class TouchPolicy(Policy):
         flows = tensordict[PROPOSALS] if self.proposals else tensordict[FLOW][:, None]  # [E, K, N, 3]
         count = flows.shape[1]
         place = torch.where(held, tip, state.origin)
-        near = squared_distances(obs["points"], place.to(obs["points"])[:, None]).squeeze(-1) < NEAR**2
-        body = near & valid if part is None else part
-        twists = torch.stack(
-            [self._twist(obs["points"], flow, valid, part, place, state.origin) for flow in flows.unbind(1)], 1
-        )
+        if part is None:
+            squared = squared_distances(obs["points"], place.to(obs["points"])[:, None]).squeeze(-1)
+            body = (squared < NEAR**2) & valid
+            weights = [local_weight(flow, squared).masked_fill(~valid, 0.0) for flow in flows.unbind(1)]
+        else:
+            body, weights = part, [part.to(flows)] * count
+        each = zip(flows.unbind(1), weights, strict=True)
+        twists = torch.stack([_twist(obs["points"], flow, weight, state.origin) for flow, weight in each], 1)
         prior = tip.new_zeros(len(tip), count)
         if self.proposals:
             prior = Hypotheses(flows, tensordict[LOG_PROBABILITIES]).of_clouds(body).double().log()
@@ -297,16 +296,16 @@ class TouchPolicy(Policy):
         aligned = torch.where((candidates * state.moment[:, None]).sum(-1, keepdim=True) < 0, -1.0, 1.0)
         right = aligned * state.moment[:, None] + guess
         total = state.information + trust
-        found = torch.linalg.solve(total[:, None], right[..., None]).squeeze(-1)  # [E, 2K, 6]
-        fits = 0.5 * ((right * found).sum(-1) - (candidates * guess).sum(-1))
-        ways = found @ rows.mT  # [E, 2K, 3]
-        found = found / length(ways).clamp_min(1e-3)
+        fused = torch.linalg.solve(total[:, None], right[..., None]).squeeze(-1)  # [E, 2K, 6]
+        fits = 0.5 * ((right * fused).sum(-1) - (candidates * guess).sum(-1))
+        ways = fused @ rows.mT  # [E, 2K, 3]
+        fused = fused / length(ways).clamp_min(1e-3)
         ways = normalize(ways)
-        for_it = self._gained(state) + torch.where(blocked, 0.0, o.keeps)
-        keeps = torch.where(pulled & held, for_it * (ways @ normalize(state.asked)[..., None]).squeeze(-1), 0.0)
-        best = (prior + fits + (found * state.evidence[:, None]).sum(-1) + keeps).argmax(1)
+        goes_on = self._gained(state) + torch.where(blocked, 0.0, o.keeps)
+        keeps = torch.where(pulled & held, goes_on * (ways @ normalize(state.asked)[..., None]).squeeze(-1), 0.0)
+        best = (prior + fits + (fused * state.evidence[:, None]).sum(-1) + keeps).argmax(1)
         row = torch.arange(len(tip))
-        twist, direction = found[row, best], ways[row, best]
+        twist, direction = fused[row, best], ways[row, best]
 
         unseen = (direction == 0).all(-1, keepdim=True)  # the hand may hide a small part: pull on as before
         direction = torch.where(unseen, normalize(sense * tensordict["policy", "pull"].double()), direction)
@@ -317,7 +316,7 @@ class TouchPolicy(Policy):
         field = twist[:, None, :3] + torch.linalg.cross(
             twist[:, None, 3:].expand(-1, valid.shape[1], -1), obs["points"].double() - state.origin[:, None]
         )
-        moving = body & (flow.norm(dim=-1) > MOVES) if part is None else body & valid
+        moving = body & (flow.norm(dim=-1) > MOVES) if part is None else body
         field = (sense[..., None] * field).masked_fill(~moving[..., None], 0.0)
         field = field / field.norm(dim=-1).amax(1)[:, None, None].clamp_min(1e-9)
         measured = state.information.flatten(1).any(1)[:, None, None]
@@ -326,20 +325,20 @@ class TouchPolicy(Policy):
             flow = torch.where(body[..., None], flow, tensordict[FLOW])
         return flow, twist, direction
 
-    def _twist(
-        self, points: Tensor, flow: Tensor, valid: Tensor, part: Tensor | None, place: Tensor, origin: Tensor
-    ) -> Tensor:
-        """The twist [E, 6] at ``origin`` [E, 3] that fits a flow, of unit speed there unless that is near its axis."""
-        if part is None:
-            squared = squared_distances(points, place.to(points)[:, None]).squeeze(-1)
-            weight = local_weight(flow, squared).masked_fill(~valid, 0.0)
-        else:
-            weight = part.to(points.dtype)
-        velocity, omega = (x.double() for x in rigid_motion(points, flow, weight, origin.to(points), 1e-4))
-        largest = flow.norm(dim=-1).amax(1, keepdim=True).double()
-        # Near the axis the scale would be arbitrary.
-        speed = torch.maximum(length(velocity), 0.2 * largest).clamp_min(1e-9)
-        return torch.cat([velocity, omega], -1) / speed
+
+def _twist(points: Tensor, flow: Tensor, weight: Tensor, origin: Tensor) -> Tensor:
+    """The twist [E, 6] at ``origin`` [E, 3] that fits a flow best, of unit speed there unless that is near its axis."""
+    velocity, omega = (x.double() for x in rigid_motion(points, flow, weight, origin.to(points), 1e-4))
+    largest = flow.norm(dim=-1).amax(1, keepdim=True).double()
+    # Near the axis the scale would be arbitrary.
+    speed = torch.maximum(length(velocity), 0.2 * largest).clamp_min(1e-9)
+    return torch.cat([velocity, omega], -1) / speed
+
+
+def _along(state: TouchState) -> Tensor:
+    """The row [E, 6] that takes a twist to the held point's speed in the direction of the last pull."""
+    point = state.tip - state.stretch
+    return (_velocity_at(point - state.origin).mT @ normalize(state.asked)[..., None]).squeeze(-1)
 
 
 def _velocity_at(arm: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from fb3d_rl.models.artflownet import Hypotheses
+from fb3d_rl.models.artflownet import Hypotheses, proposes_several
 from fb3d_rl.training.device import products_of
 from fb3d_rl.training.draws import augment
 from fb3d_rl.training.hypotheses import hypotheses_loss
@@ -36,7 +36,7 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
     flows. ``share`` is the part of the whole batch that the objective is called with.
     """
     network = model.module if isinstance(model, DistributedDataParallel) else model
-    several = getattr(network, "hypotheses", 1) > 1
+    several = proposes_several(network)
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
         link = batch["privileged", "link"] if several else None
