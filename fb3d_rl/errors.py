@@ -32,11 +32,13 @@ def exit_code(work: Callable[[], int | None], interrupted: str) -> int:
     """
     try:
         return work() or 0
-    except UserError as error:
+    except Interrupted as error:
         sentence = str(error)
     except (Exception, KeyboardInterrupt) as error:
         if caused(error):
             sentence = f"interrupted; {interrupted}"
+        elif isinstance(error, UserError):
+            sentence = str(error)
         elif isinstance(error, OSError) and (disk_error := of_disk(error)) is not None:
             sentence = disk_error
         else:

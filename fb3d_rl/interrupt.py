@@ -23,6 +23,7 @@ CODE = 2
 
 _begun = False  # run() was called
 _waiting = False  # Ctrl-C was pressed during an import, and is to come again after it
+_raised = False  # Ctrl-C became an exception, which a library may have swallowed
 
 
 def expect() -> None:
@@ -55,8 +56,33 @@ def run(main: Callable[[], int | None]) -> NoReturn:
     sys.exit(code)
 
 
+class Deferred:
+    """Where Ctrl-C waits for the end of the ``with`` block.
+
+    For calls of libraries that catch every exception: a ``KeyboardInterrupt`` in them would be lost, or come out as a
+    statement about the file that they read.
+    """
+
+    blocks = 0
+    pressed = False
+
+    def __enter__(self) -> None:
+        Deferred.blocks += 1
+
+    def __exit__(self, *_: object) -> None:
+        Deferred.blocks -= 1
+        if not Deferred.blocks and Deferred.pressed:
+            Deferred.pressed = False
+            _signal.raise_signal(_signal.SIGINT)
+
+
 def caused(error: BaseException) -> bool:
-    """Whether Ctrl-C is what ``error`` comes from: clean-up that it interrupts may raise another exception."""
+    """Whether Ctrl-C is what ``error`` comes from.
+
+    Clean-up that it interrupts may raise another exception, and a library that catches it may report one of its own.
+    """
+    if _raised:
+        return True
     seen: set[int] = set()
     cause: BaseException | None = error
     while cause is not None and id(cause) not in seen:
@@ -68,9 +94,13 @@ def caused(error: BaseException) -> bool:
 
 
 def _pressed(number: int, frame: FrameType | None) -> None:
-    global _waiting
+    global _waiting, _raised
+    if Deferred.blocks:
+        Deferred.pressed = True
+        return
     importer = _importer(frame)
     if _begun and importer is None:
+        _raised = True
         raise KeyboardInterrupt
     if not _begun or _waiting or importer == "__main__":
         os.write(2, b"error: interrupted before the work began\n" if not _waiting else b"error: interrupted\n")

@@ -128,12 +128,12 @@ def _one_sentence(where: str = "") -> Iterator[None]:
         yield
     except Interrupted as error:
         sys.exit(failure(str(error)).code)  # the whole sweep
-    except UserError as error:
-        raise failure(str(error)) from error
     except (Exception, KeyboardInterrupt) as error:
         if interrupt.caused(error):
             hint = "a folder with a checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER"
             sys.exit(failure(f"interrupted; {hint}").code)
+        if isinstance(error, UserError):
+            raise failure(str(error)) from error
         if isinstance(error, HydraException | OmegaConfBaseException):
             raise failure(_sentence(error)) from error
         if isinstance(error, OSError) and (sentence := of_disk(error)) is not None:

@@ -69,6 +69,32 @@ def main():
     finally:
         None.missing
 """
+READS_A_FILE = """
+def main():
+    try:
+        press()
+        time.sleep(9)
+    except BaseException:
+        pass
+    from fb3d_rl.errors import UserError
+    raise UserError("no file can be read")
+"""
+READS_A_MESH = """
+from pathlib import Path
+import trimesh
+from fb3d_rl.assets.urdf import UrdfReader
+def swallows(path, **_):
+    try:
+        press()
+        time.sleep(0.3)
+    except BaseException:
+        raise ValueError("there is no such file")
+    return trimesh.creation.box()
+trimesh.load_mesh = swallows
+def main():
+    Path("mesh.obj").touch()
+    UrdfReader(Path("."), Path("mobility.urdf")).mesh("mesh.obj")
+"""
 EXIT_CODE = """
 from fb3d_rl.errors import exit_code
 interrupt.run(lambda: exit_code(main, "all is kept"))
@@ -99,6 +125,11 @@ PROGRAMS = {
     "where a command's clean-up fails": (BEGIN + CLEAN_UP_FAILS + EXIT_CODE, 2, "error: interrupted; all is kept\n"),
     "where clean-up fails under Hydra": (BEGIN + CLEAN_UP_FAILS + LAUNCHED, 2, "error: interrupted; a folder with a "
                                          "checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER\n"),
+    "where a library swallows it": (BEGIN + READS_A_FILE + EXIT_CODE, 2, "error: interrupted; all is kept\n"),
+    "where a library swallows it under Hydra": (
+        BEGIN + READS_A_FILE + LAUNCHED, 2, "error: interrupted; a folder with a "
+        "checkpoint.pt or rows.csv goes on with: resume=true hydra.run.dir=FOLDER\n"),
+    "while a mesh is read": (BEGIN + READS_A_MESH + "interrupt.run(main)", 2, "error: interrupted\n"),
     "where it is ignored": (IGNORED + BEGIN + "interrupt.run(press)", 0, ""),
 }  # fmt: skip
 

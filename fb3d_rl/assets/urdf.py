@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from fb3d_rl.assets.articulation import Joint, JointType, Link, Mesh
 from fb3d_rl.assets.cache import Parsed
 from fb3d_rl.errors import UserError
+from fb3d_rl.interrupt import Deferred
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
@@ -273,7 +274,8 @@ class UrdfReader:
         if not path.is_file():
             self.fail(f"the mesh {filename} is missing")
         try:
-            loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
+            with Deferred():  # trimesh catches every exception while it looks for the file
+                loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
             vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
             faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
         except BROKEN as error:
