@@ -153,8 +153,12 @@ def _validate_training(cfg: TrainConfig) -> None:
     if isinstance(algo, FlowNetworkOptions):
         if not REGISTRY[algo.name].maskless and not algo.part_mask_input:
             raise UserError(f"algo={algo.name} is of one part, which the mask shows: leave algo.part_mask_input=true")
-        if cfg.policy.mask == "none" and REGISTRY[algo.name].maskless and algo.part_mask_input:
-            raise UserError("policy.mask=none keeps the mask from the network too: give algo.part_mask_input=false")
+        needs_mask = algo.part_mask_input and not cfg.data.unmasked_share
+        if cfg.policy.mask == "none" and REGISTRY[algo.name].maskless and needs_mask:
+            raise UserError(
+                "policy.mask=none keeps the mask from the network too: give algo.part_mask_input=false, or "
+                "data.unmasked_share=0.2 for a network that does with and without"
+            )
     elif isinstance(algo, ImitationOptions):
         _validate_imitation(algo, cfg.collector, cfg.data.labels)
     _at_least("data.train_samples", cfg.data.train_samples, 1)

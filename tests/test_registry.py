@@ -14,7 +14,7 @@ from fb3d_rl.algos.learners import acting_policy
 from fb3d_rl.algos.options import AlgoOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
-from fb3d_rl.policies.flow_policy import MASK, FlowPolicyOptions, expert_policy
+from fb3d_rl.policies.flow_policy import MASK, FlowPolicyOptions, artflownet_policy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import Learner, LearnerOptions
 from fb3d_rl.registry import REGISTRY, WITHOUT_MASK, behind, truths, truths_table
@@ -79,6 +79,15 @@ def test_no_policy_is_missing_and_the_documents_say_the_same() -> None:
 def test_without_a_mask_the_network_s_module_reads_none_either() -> None:
     assert MASK not in artflownet_module(ArtFlowNet(False, 8)).in_keys
     assert MASK in artflownet_module(ArtFlowNet(True, 8)).in_keys
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_a_network_whose_mask_is_optional_acts_without_one(learn: bool) -> None:
+    net = ArtFlowNet(True, 8, mask_optional=True)
+    without, given = (
+        artflownet_policy(net, LIMITS, FlowPolicyOptions(mask=mask, learn=learn)) for mask in ("none", "target")
+    )
+    assert MASK not in without.in_keys and MASK in given.in_keys
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -273,14 +273,18 @@ def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
     generator = torch.Generator().manual_seed(cfg.seed)
     if algo.hypotheses > 1 and kind.network is not ArtFlowNet:
         raise UserError(f"algo={algo.name} proposes one answer: leave algo.hypotheses=1")
-    further = {"hypotheses": algo.hypotheses} if kind.network is ArtFlowNet else {}
+    further: dict[str, Any] = {}
+    if kind.network is ArtFlowNet:
+        further = {"hypotheses": algo.hypotheses, "mask_optional": cfg.data.unmasked_share > 0}
     net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator, **further)
     if algo.start_from:
         begun = load_trained(algo.start_from, kind.network)
-        if begun.arguments != net.arguments:
-            different = [
-                f"algo.{key}={value}" for key, value in begun.arguments.items() if net.arguments.get(key) != value
-            ]
+        different = [
+            f"algo.{key}={value}"
+            for key, value in begun.arguments.items()
+            if key != "mask_optional" and net.arguments.get(key) != value
+        ]
+        if different:
             raise UserError(f"algo.start_from={algo.start_from} is another network; give {' '.join(different)}")
         net.load_state_dict(begun.state_dict())
     return net

@@ -56,12 +56,13 @@ class ArtFlowNet(CloudNetwork):
         backbone: "pointnet2" or "delayed".
         generator: draws the first weights.
         hypotheses: K, how many flows it proposes for each cloud, each with a probability; with 1 it is the paper's.
+        mask_optional: whether it was trained on clouds without a mask, too, so that the mask may be left out.
 
     Shapes:
         points [B, N, 3] f32, m, world axes; valid [B, N] bool; part_mask [B, N] bool -> flow [B, N, 3] f32,
         world axes, trained towards a largest norm of 1 in a cloud; 0 on invalid points. A network that was
         trained without part_mask does not read it. With several hypotheses it is the most probable one: of the part if
-        the network reads the mask, else of each point.
+        the network is given the mask, else of each point.
     """
 
     NAME = "artflownet"
@@ -74,10 +75,12 @@ class ArtFlowNet(CloudNetwork):
         backbone: str = "pointnet2",
         generator: torch.Generator | None = None,
         hypotheses: int = 1,
+        mask_optional: bool = False,
     ) -> None:
         self.hypotheses = hypotheses
         super().__init__(part_mask_input, neighbors, backbone, generator)
-        self.arguments["hypotheses"] = hypotheses
+        self.mask_optional = mask_optional or not part_mask_input
+        self.arguments |= {"hypotheses": hypotheses, "mask_optional": self.mask_optional}
 
     def outputs(self) -> int:
         """Of each hypothesis a flow, and a score if there are several."""
@@ -106,8 +109,7 @@ class ArtFlowNet(CloudNetwork):
         """The flow [B, N, 3] of the most probable hypothesis, see the class."""
         if self.hypotheses == 1:
             return found.flows[:, 0]
-        if self.part_mask_input:
-            assert part_mask is not None
+        if self.part_mask_input and part_mask is not None:
             best = found.of_clouds(part_mask & valid).argmax(1)[:, None].expand_as(valid)
         else:
             best = found.log_probabilities.argmax(1)
@@ -123,7 +125,7 @@ class ArtFlowNet(CloudNetwork):
 
         Args:
             points: [N, 3] m, z up; an array or a tensor on any device. Points that are not finite count as missing.
-            part_mask: [N] bool, the points on the part to open; needed if the network was trained with it.
+            part_mask: [N] bool, the points on the part to open; needed if the network was trained with nothing else.
 
         Returns:
             [N, 3] f32 of the kind of ``points``, on its device; largest norm about 1, 0 where a point is missing.
@@ -134,7 +136,8 @@ class ArtFlowNet(CloudNetwork):
         cloud, mask = self._checked(points, part_mask)
         flows, log_probabilities = self._dealt(cloud, mask)
         valid = cloud.isfinite().all(1)
-        flow = self.most_probable(Hypotheses(flows[None], log_probabilities[None]), valid[None], mask[None])
+        shown = None if part_mask is None else mask[None]
+        flow = self.most_probable(Hypotheses(flows[None], log_probabilities[None]), valid[None], shown)
         return _as_given(flow[0], points)
 
     @torch.no_grad()
@@ -165,10 +168,10 @@ class ArtFlowNet(CloudNetwork):
         cloud = torch.as_tensor(points)
         if cloud.ndim != 2 or cloud.shape[1] != 3 or not cloud.is_floating_point():
             raise UserError(f"The cloud is {cloud.dtype} {list(cloud.shape)}: give floats [N, 3].")
-        if part_mask is None and self.part_mask_input:
+        if part_mask is None and needs_mask(self):
             raise UserError("This network was trained with the mask of the part to open: give part_mask, [N] bool.")
         count = len(cloud)
-        mask = torch.zeros(count, dtype=torch.bool) if part_mask is None else torch.as_tensor(part_mask)
+        mask = torch.ones(count, dtype=torch.bool) if part_mask is None else torch.as_tensor(part_mask)
         if mask.shape != (count,):
             raise UserError(f"The mask is {list(mask.shape)} for {count} points: give [N] bool.")
         device = next(self.parameters()).device
@@ -218,12 +221,17 @@ def reads_mask(net: nn.Module) -> bool:
     return bool(getattr(net, "part_mask_input", True))
 
 
+def needs_mask(net: nn.Module) -> bool:
+    """Whether a network cannot do without the mask of the part to open."""
+    return reads_mask(net) and not getattr(net, "mask_optional", False)
+
+
 def proposes_several(net: nn.Module) -> TypeGuard[ArtFlowNet]:
     """Whether a network proposes several flows for each cloud."""
     return isinstance(net, ArtFlowNet) and net.hypotheses > 1
 
 
-def artflownet_module(net: nn.Module, proposals: bool = False) -> TensorDictModule:
+def artflownet_module(net: nn.Module, proposals: bool = False, masked: bool = True) -> TensorDictModule:
     """Read the observation's points, valid and, if the network was trained with it, part_mask; write ("prediction",
     "flow"), what the network answers; of several hypotheses the most probable.
 
@@ -231,8 +239,10 @@ def artflownet_module(net: nn.Module, proposals: bool = False) -> TensorDictModu
         net: the network.
         proposals: whether all hypotheses are written, too, if there are several: ("prediction", "flows") [B, K, N, 3]
             and ("prediction", "log_probabilities") [B, K, N].
+        masked: whether a network that reads the mask is given it; one with ``mask_optional`` does without.
     """
-    keys = [("observation", key) for key in ("points", "valid", *(["part_mask"] if reads_mask(net) else []))]
+    mask = ["part_mask"] if masked and reads_mask(net) else []
+    keys = [("observation", key) for key in ("points", "valid", *mask)]
     module, names = net, ["flow"]
     if proposals and proposes_several(net):
         module, names = _Proposals(net), ["flow", "flows", "log_probabilities"]

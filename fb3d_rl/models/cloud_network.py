@@ -71,8 +71,8 @@ class CloudNetwork(nn.Module):
         """Make what a network has beside its PointNet++: nothing, here."""
 
     def per_point(self, points: Tensor, valid: Tensor, part_mask: Tensor | None) -> Tensor:
-        """Points [B, N, 3] f32 (m, world axes), valid [B, N] bool and part_mask [B, N] bool -> [B, N, OUTPUTS]; 0 on
-        invalid points.
+        """Points [B, N, 3] f32 (m, world axes), valid [B, N] bool and part_mask [B, N] bool, None where nobody marked a
+        part -> [B, N, OUTPUTS]; 0 on invalid points.
         """
         inside = valid[..., None].to(points.dtype)
         # Padding may hold anything, even NaN, which a product with 0 would keep.
@@ -80,8 +80,8 @@ class CloudNetwork(nn.Module):
         centre = points.sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1.0)
         features = None
         if self.part_mask_input:
-            assert part_mask is not None
-            features = part_mask[..., None].to(points.dtype)
+            shown = valid if part_mask is None else part_mask  # as it was trained where there is none
+            features = shown[..., None].to(points.dtype)
         output: Tensor = self.network(points - centre, valid, features)
         return output
 

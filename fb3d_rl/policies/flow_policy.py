@@ -39,7 +39,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 
 from fb3d_rl.geometry.transforms import alignment
-from fb3d_rl.models.artflownet import artflownet_module, proposes_several, reads_mask
+from fb3d_rl.models.artflownet import artflownet_module, needs_mask, proposes_several
 from fb3d_rl.policies.commands import above_ground, command
 from fb3d_rl.policies.contact import Contact, best_candidate
 from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
@@ -161,14 +161,14 @@ def artflownet_policy(
     With ``options.learn`` the prediction is corrected by touch (:class:`~fb3d_rl.policies.touch.TouchPolicy`).
 
     Raises:
-        UserError: the network reads the mask that the options keep from the policy.
+        UserError: the options keep a mask from the policy that the network cannot do without.
     """
     from fb3d_rl.policies.touch import TouchPolicy  # imported late, as it holds a FlowPolicy
 
-    if options is not None and reads_mask(net):
-        options.require_mask("a network that was trained with the mask")
     options = options or FlowPolicyOptions()
-    if not options.learn:
-        return TensorDictSequential(artflownet_module(net), FlowPolicy(("prediction", "flow"), limits, options))
-    touch = TouchPolicy(limits, options, proposes_several(net))
-    return TensorDictSequential(artflownet_module(net, proposals=True), touch)
+    if needs_mask(net):
+        options.require_mask("a network that was trained with the mask alone")
+    module = artflownet_module(net, proposals=options.learn, masked=options.mask == "target")
+    if options.learn:
+        return TensorDictSequential(module, TouchPolicy(limits, options, proposes_several(net)))
+    return TensorDictSequential(module, FlowPolicy(("prediction", "flow"), limits, options))

@@ -88,6 +88,25 @@ def test_part_mask_is_read_only_if_asked_for(make_net: Maker) -> None:
         assert torch.equal(net(points, valid, mask), net(points, valid, ~mask)) is not used
 
 
+@pytest.mark.parametrize("hypotheses", [1, 3])
+def test_where_the_mask_is_optional_none_is_a_mask_of_all_points(tmp_path: Path, hypotheses: int) -> None:
+    net = ArtFlowNet(True, 8, "pointnet2", torch.Generator().manual_seed(0), hypotheses, mask_optional=True).eval()
+    points, valid, _ = make_batch()
+    assert torch.equal(net.propose(points, valid).flows, net.propose(points, valid, valid).flows)
+    cloud, everywhere = points[0], torch.ones(len(points[0]), dtype=torch.bool)
+    for found, expected in zip(net.predict_all(cloud), net.predict_all(cloud, everywhere), strict=True):
+        assert found.shape == expected.shape
+    assert net.predict(cloud).abs().max() > 0
+    assert ("observation", "part_mask") not in artflownet_module(net, masked=False).in_keys
+    assert ("observation", "part_mask") in artflownet_module(net).in_keys
+    net.save_pretrained(tmp_path / "net.safetensors")
+    again = ArtFlowNet.from_pretrained(tmp_path / "net.safetensors")
+    assert torch.equal(again.predict(cloud), net.predict(cloud))
+    needy = ArtFlowNet(True, 8, "pointnet2", torch.Generator().manual_seed(0), hypotheses)
+    with pytest.raises(UserError, match="give part_mask"):
+        needy.predict(cloud)
+
+
 def test_empty_clouds_give_zeros(make_net: Maker) -> None:
     points, valid, mask = make_batch()
     valid[1] = False
