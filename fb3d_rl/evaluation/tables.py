@@ -81,7 +81,9 @@ STEPS = Metric("steps_to_success", "steps to success", "steps", bounds=_POSITIVE
 SECONDS = Metric("seconds_to_success", "simulated seconds to success", "seconds", bounds=_POSITIVE, decimals=1)
 PATH = Metric("path_length", "way of the tip, m", "way", bounds=_POSITIVE)
 LOST = Metric("times_lost", "times that hold was lost", "lost", bounds=_POSITIVE)
-EFFORT = (STEPS, SECONDS, PATH, LOST)
+PULLS = Metric("pulls_until_moved", "pulls until the part moved the right way", "pulls", bounds=_POSITIVE)
+"""Over the parts that did."""
+EFFORT = (STEPS, SECONDS, PATH, LOST, PULLS)
 """The effort of trials; rows of earlier versions lack these numbers."""
 DECISION = Metric("time/decision_ms", "wall time of a decision, ms", "ms", decimals=1)
 """Median over the decisions of a run, on the machine that it ran on; rows do not hold it."""
@@ -103,6 +105,7 @@ _VALUES: dict[str, Callable[[Any], float | None]] = {
     "seconds_to_success": lambda row: row.seconds if row.success and row.seconds >= 0 else None,
     "path_length": lambda row: row.path_length if row.path_length >= 0 else None,
     "times_lost": lambda row: float(row.lost) if row.lost >= 0 else None,
+    "pulls_until_moved": lambda row: float(row.pulls) if row.pulls >= 0 else None,
 }
 """What a row contributes to each metric; None: this row does not count."""
 

@@ -68,6 +68,8 @@ class TrialRow:
             was not recorded.
         held_opened: at some time a part that suction had held was open, by the same rule from its own start: the target
             or, where suction holds any part, another one.
+        pulls: how many pulls began until the part had moved the right way
+            (:func:`fb3d_rl.rollout.pulls.pulls_until_moved`); -1 if it never did, or if it was not recorded.
 
     Raises:
         ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success, an
@@ -99,6 +101,7 @@ class TrialRow:
     policy_digest: str = ""
     mask: str = ""
     held_opened: bool = False
+    pulls: int = -1
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):

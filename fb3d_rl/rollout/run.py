@@ -23,6 +23,7 @@ from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.policy import initial_state
 from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers
 from fb3d_rl.rollout.decisions import DECISION, TimedPolicy, TookTooLong
+from fb3d_rl.rollout.pulls import pulls_until_moved
 from fb3d_rl.rollout.rows import (
     CRASHED,
     LOST,
@@ -183,6 +184,7 @@ def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
         path_length=float(tips.double().diff(dim=0).norm(dim=1).sum()),
         held_opened=bool(after["held_opened"].any()),
         lost=int((attached[:-1] & ~attached[1:]).sum()),
+        pulls=pulls_until_moved(tips, attached, distance),
     )
 
 

@@ -89,13 +89,14 @@ def test_a_crashed_trial_counts_as_a_failure() -> None:
 
 def test_what_it_took_counts_the_trials_that_it_is_about() -> None:
     rows = [
-        trial("Oven", "a", True, steps=50, seconds=2.5, path_length=1.0, lost=0),
-        trial("Oven", "a", True, steps=70, seconds=3.5, path_length=2.0, lost=1),
+        trial("Oven", "a", True, steps=50, seconds=2.5, path_length=1.0, lost=0, pulls=1),
+        trial("Oven", "a", True, steps=70, seconds=3.5, path_length=2.0, lost=1, pulls=2),
         trial("Oven", "b", False, steps=150, seconds=7.5, path_length=4.5, lost=4),
     ]
     numbers = summary(rows, [], {"artflownet/time/decision_ms": 12.34})
     assert (numbers["steps_to_success"], numbers["seconds_to_success"]) == (60, 3.0), "only those that succeeded"
     assert (numbers["path_length"], numbers["times_lost"]) == ((1.5 + 4.5) / 2, (0.5 + 4) / 2), "all of them"
+    assert numbers["pulls_until_moved"] == 1.5, "only those that moved"
     with Console(width=100, record=True, file=io.StringIO()) as console:
         show(numbers, console)
     printed = console.export_text()
@@ -106,11 +107,13 @@ def test_what_it_took_counts_the_trials_that_it_is_about() -> None:
         "3.0",
         "3.00",
         "2.25",
+        "1.50",
         "12.3",
     ]
 
     early = summary([trial("Oven", "a", False)], [])  # recorded before these numbers were
-    assert early["path_length"] is early["times_lost"] is early["seconds_to_success"] is None
+    assert early["path_length"] is early["times_lost"] is early["pulls_until_moved"] is None
+    assert early["seconds_to_success"] is None
     with Console(width=100, record=True, file=io.StringIO()) as console:
         show(early, console)
     assert "What it took" not in console.export_text()

@@ -28,6 +28,7 @@ from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 from fb3d_rl.rollout.collectors import CollectorOptions
+from fb3d_rl.rollout.pulls import pulls_until_moved
 from fb3d_rl.rollout.run import _outcome, limits_of, run_trials
 from fb3d_rl.rollout.trials import Scheduled, schedule
 
@@ -313,6 +314,23 @@ def test_why_trials_fail() -> None:
     outcome = _outcome(frames(slowly, held, blinking), control_freq=20)
     assert outcome["lost"] == 3 and outcome["seconds"] == 2.0
     assert outcome["path_length"] == pytest.approx(0.4)
+
+
+def test_pulls_until_the_part_moves_the_right_way() -> None:
+    def tips(*ways: float) -> torch.Tensor:  # along x, cm in each step
+        return torch.tensor([[x, 0.0, 0.0] for x in (0.0, *ways)]).cumsum(0) / 100
+
+    def pulls(ways: list[float], attached: list[bool], distance: list[float]) -> int:
+        return pulls_until_moved(tips(*ways), torch.tensor(attached), torch.tensor(distance))
+
+    held = [True] * 8
+    opens = [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.94, 0.5]
+    assert pulls([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0], held, opens) == 1
+    assert pulls([0.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0, -1.0], held, opens) == 2, "it turned round"
+    assert pulls([0.0, 0.1, -0.1, 0.1, -0.1, 0.1, 1.0, 1.0], held, opens) == 1, "it trembled"
+    assert pulls([1.0] * 8, [True, False, False, True, True, True, True, True], opens) == 2, "it was held twice"
+    assert pulls([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, -1.0], held, opens) == 1, "afterwards it does not count"
+    assert pulls([1.0] * 8, held, [1.0] * 8) == -1, "it never moved"
 
 
 def test_a_goal_on_either_side_is_reached_by_the_flow_and_its_inverse(
