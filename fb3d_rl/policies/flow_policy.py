@@ -14,7 +14,7 @@ TRAVEL   tip, hand axis, force              on the approach line: APPROACH;     
 APPROACH tip, force, suction                held: PULL;                               along the approach line, slow from
                                             pressed too long, or missed: RETREAT      the pre-contact point on
 PULL     cloud, flow, tip, suction          hold lost: RETREAT;                       along the flow at the tip; the
-                                            no progress: RELEASE                      hand turns as the flow does
+                                            no progress, held badly: RELEASE          hand turns as the flow does
 RETREAT  tip, force                         far enough away, or halted: SELECT        away from the contact point
 RELEASE  suction                            off: RETREAT;                             away across the flow, at full
                                             still held after a while: PULL            speed

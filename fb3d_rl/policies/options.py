@@ -200,6 +200,12 @@ class FlowPolicyOptions:
         "m",
         "[0, inf)",
     )
+    regrasp: float | None = option(
+        None,
+        "how much larger than where it holds the largest flow of the part has to be, as a share of it, for the hand to "
+        "let go and hold there (FlowBotHD's smart grasp point is 0.2); null: it never does",
+        within="(0, 1]",
+    )
     learn: bool = option(True, "whether the flow that a network predicts is corrected by what its pulls measure")
     touch: TouchOptions = group(TouchOptions)
     mask: Literal["target", "none"] = "target"

@@ -7,9 +7,12 @@ changes nothing in place and leaves ``state.tip``, which is still the tip of the
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
+from fb3d_rl.geometry.points import squared_distances
 from fb3d_rl.geometry.transforms import alignment, dot, length, normalize
 from fb3d_rl.policies.contact import choose_contact
 from fb3d_rl.policies.flow_state import (
@@ -83,11 +86,13 @@ def after_approach(state: FlowState, seen: Observed, control: Control) -> FlowSt
 
 
 def after_pull(state: FlowState, seen: Observed, control: Control) -> FlowState:
-    """Hold is lost: RETREAT, from where the hand is. Stuck: RELEASE, if another point may be chosen."""
+    """Hold is lost: RETREAT, from where the hand is. Stuck, or held where the flow is small: RELEASE, if another point
+    may be chosen.
+    """
     progress = seen.sense * dot(seen.tip - state.tip, state.pull)
     state = _count(state, seen.attached & (progress < control.still))
     lost = ~seen.attached
-    stuck = seen.attached & (state.idle > control.stuck) & may_choose(state, control)
+    stuck = seen.attached & ((state.idle > control.stuck) | _held_badly(seen, control)) & may_choose(state, control)
     state = state.changed(lost, phase=RETREAT, leave=state.standoff, contact_point=seen.tip, standoff=seen.hand)
     state = state.given_up(stuck, seen.tip)
     return state.changed(stuck, phase=RELEASE, leave=across_flow(seen.hand, state.pull), idle=0)
@@ -128,10 +133,11 @@ def select(state: FlowState, seen: Observed, control: Control) -> FlowState:
         near = (seen.points - failed).norm(dim=-1) < control.options.retry_distance
         avoid |= near & (slot < state.tries)
     tip, hand = seen.tip.to(seen.points), seen.hand.to(seen.points)
+    contact, regrasp = control.options.contact, control.options.regrasp
+    if regrasp is not None:  # else it would let go again
+        contact = replace(contact, min_flow=max(contact.min_flow, 1.0 - regrasp))
     return state.set_out(
-        *choose_contact(
-            seen.points, seen.valid, seen.part, flow, seen.camera, tip, hand, avoid, control.options.contact
-        )
+        *choose_contact(seen.points, seen.valid, seen.part, flow, seen.camera, tip, hand, avoid, contact)
     )
 
 
@@ -149,6 +155,18 @@ def across_flow(hand: Tensor, pull: Tensor) -> Tensor:
     away = hand - dot(hand, pull) * pull
     up = torch.tensor([0.0, 0.0, 1.0], dtype=pull.dtype, device=pull.device)
     return normalize(torch.where(length(away) > 0.3, away, torch.linalg.cross(pull, up.expand_as(pull))))
+
+
+def _held_badly(seen: Observed, control: Control) -> Tensor:
+    """Whether the flow is much larger elsewhere than where the hand holds [E, 1] bool."""
+    if control.options.regrasp is None:
+        return torch.zeros_like(seen.attached)
+    usable = seen.valid if seen.part is None else seen.part & seen.valid
+    size = seen.flow.norm(dim=-1).masked_fill(~usable, 0.0)
+    squared = squared_distances(seen.points, seen.tip.to(seen.points)[:, None]).squeeze(-1)
+    here = size.gather(1, squared.masked_fill(~usable, torch.inf).argmin(1, keepdim=True))
+    largest = size.amax(1, keepdim=True)
+    return largest - here > control.options.regrasp * largest
 
 
 def _count(state: FlowState, idle: Tensor) -> FlowState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -155,6 +156,20 @@ def test_a_pull_that_makes_no_progress_is_given_up_for_a_release() -> None:
     assert int(after_pull(state, fast, CONTROL).phase) == PULL
     once = Control(FlowPolicyOptions(retries=0), CONTROL.limits)
     assert int(after_pull(state.updated(chosen=torch.tensor([[1]])), slow, once).phase) == PULL, "no more retries"
+
+
+def test_a_hand_that_holds_where_the_flow_is_small_lets_go_if_it_is_to_regrasp() -> None:
+    seen = see((-0.12, 0.3, 0.5), attached=True)
+    hinged = (0.4 - seen.points[..., 1:2]) / 0.8 * seen.flow  # 1 at the far edge, 0.125 where it holds
+    seen, state = replace(seen, flow=hinged), at(PULL, tip=(-0.1, 0.3, 0.5))
+    regrasps = Control(FlowPolicyOptions(regrasp=0.2), CONTROL.limits)
+    after = after_pull(state, seen, regrasps)
+    assert int(after.phase) == RELEASE and torch.equal(after.tried[:, 0], seen.tip.float())
+    chosen = select(after, replace(seen, attached=torch.tensor([[False]])), regrasps)
+    assert float(chosen.contact_point[0, 1]) < -0.2, "it tries where the lever is long"
+    assert int(after_pull(state, seen, CONTROL).phase) == PULL, "not unless asked to"
+    near = replace(seen, tip=vector(-0.12, -0.3, 0.5))
+    assert int(after_pull(state.updated(tip=vector(-0.1, -0.3, 0.5)), near, regrasps).phase) == PULL, "it holds well"
 
 
 def test_a_lost_hand_backs_off_from_where_it_is() -> None:
