@@ -244,6 +244,11 @@ def has_flow(numbers: Mapping[str, Any]) -> bool:
     return "flow/n" in numbers
 
 
+def has_proposals(numbers: Mapping[str, Any]) -> bool:
+    """Whether a summary is of a network that proposes several flows."""
+    return has_flow(numbers) and (numbers.get("flow/probability") or 1.0) < 1.0
+
+
 def trainings(numbers: Mapping[str, Any]) -> str:
     """A note on the number of trainings in a run's summary; empty where no policy was trained."""
     if not has_flow(numbers) and {*policies_of(numbers)} <= {*untrained()}:
@@ -269,7 +274,7 @@ def titled(title: str, words: Sequence[str], numbers: Sequence[str]) -> Table:
 
 def effort_table(numbers: Mapping[str, Any], names: Sequence[str]) -> Table:
     """The effort of trials, as a rich table with a row for each of the policies ``names``."""
-    columns = ("steps", "seconds", "way of the tip, m", "times lost", "ms a decision")
+    columns = ("steps", "seconds", "way of the tip, m", "times lost", "pulls until it moved", "ms a decision")
     table = titled("What it took, steps and seconds until success", ("policy",), columns)
     for name in names:
         table.add_row(name, *(m.show(numbers.get(f"{name}/{m.key}")) for m in (*EFFORT, DECISION)))
@@ -308,7 +313,7 @@ def tables(numbers: Mapping[str, Any]) -> list[Table]:
     listed = [_table(numbers, chunk, flow and i == 0) for i, chunk in enumerate(chunks or [[]])]
     if unmasked(numbers):
         listed.append(unmasked_table(numbers, unmasked(numbers)))
-    if flow and numbers.get("flow/probability", 1.0) < 1.0:
+    if has_proposals(numbers):
         listed.append(proposals_table(numbers))
     measured = effort_of(numbers, names)
     return [*listed, effort_table(numbers, measured)] if measured else listed

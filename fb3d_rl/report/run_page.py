@@ -11,7 +11,7 @@ import plotly.graph_objects as go
 from fb3d_rl.assets.catalog import LOST_GEOMETRY
 from fb3d_rl.evaluation import tables
 from fb3d_rl.evaluation.runs import Run, read_run
-from fb3d_rl.evaluation.tables import CONTACT, DISTANCE, FLOW, HELD, MOTION_ONLY, SUCCESS, Metric
+from fb3d_rl.evaluation.tables import AXIS, CONTACT, DISTANCE, FLOW, HELD, MOTION_ONLY, PROPOSALS, SUCCESS, Metric
 from fb3d_rl.report import clouds, curves, failure_charts, page
 from fb3d_rl.report.blocks import COPIED, FACTS, bars, effort, terms
 from fb3d_rl.report.gallery import films, gallery
@@ -83,6 +83,9 @@ def _headline(numbers: Mapping[str, Any]) -> list[Block]:
     if tables.has_flow(numbers):
         blocks.append(Heading(f"Flow · {numbers['flow/n']} held-out clouds"))
         blocks.append(Cards([_card(metric, numbers) for metric in FLOW]))
+        if tables.has_proposals(numbers):
+            blocks.append(Heading("Several proposed flows"))
+            blocks.append(Cards([_card(metric, numbers) for metric in (AXIS, *PROPOSALS)]))
     for policy in tables.policies_of(numbers):
         prefix = f"{policy}/"
         counts = f"{numbers[prefix + 'n']} trials on {numbers[prefix + 'n_objects']} objects"

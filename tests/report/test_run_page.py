@@ -93,6 +93,15 @@ def test_a_policy_without_a_mask_shows_what_it_opened_of_what_it_held(tmp_path: 
         assert ("Opened what it held" in text) == (folder == run)
 
 
+def test_a_network_that_proposes_several_flows_shows_what_they_are_worth(tmp_path: Path) -> None:
+    row = FlowRow("1", "Box", "test", "link_0", 0.5, 0.2, 0.1, axis_cosine=0.9, best_cosine=0.8, hit=0.0)
+    for probability in (1.0, 0.6):
+        write_flow(tmp_path / "flow_rows.csv", [replace(row, probability=probability)])
+        write_trials(tmp_path / "rows.csv", [])
+        text = write_report(tmp_path, tmp_path / "page.html").read_text()
+        assert ("Several proposed flows" in text) == (probability < 1.0)
+
+
 class Page(HTMLParser):
     """Collects what a browser would see."""
 
