@@ -1,10 +1,11 @@
-"""Make procedural objects; unpack, list, validate and preview objects.
+"""Make procedural objects; unpack, list, validate, preview and compare objects.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
 python launch/objects.py unpack ARCHIVE --out DIR
 python launch/objects.py list DIR [--split SPLIT]
 python launch/objects.py validate DIR [--out FILE.json] [--workers N]
 python launch/objects.py preview DIR --out FILE.png|html [--split SPLIT] [--each N]
+python launch/objects.py compare DIR OTHER [--out FILE.json] [--workers N]
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -70,6 +72,13 @@ def _parser() -> argparse.ArgumentParser:
     show.add_argument("--out", type=Path, required=True, help="file to write: .png or .html")
     show.add_argument("--split", default="all", help="a split, categories or ids, with commas (default: all)")
     show.add_argument("--each", type=int, default=8, help="at most so many of each category (default: 8)")
+
+    says = "tell how the objects below DIR differ from those below OTHER, such as real from procedural ones"
+    differ = commands.add_parser("compare", help=says, description=says)
+    differ.add_argument("dir", type=Path, metavar="DIR")
+    differ.add_argument("other", type=Path, metavar="OTHER")
+    differ.add_argument("--out", type=Path, help="also write all numbers to this file, .json")
+    differ.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
     return parser
 
 
@@ -192,12 +201,58 @@ def validate(options: argparse.Namespace) -> int:
     return 1 if broken else 0
 
 
+def compare(options: argparse.Namespace) -> None:
+    """Tell how two kinds of objects differ."""
+    from dataclasses import asdict
+
+    from rich import box
+    from rich.console import Console
+    from rich.progress import track
+    from rich.table import Table
+
+    from fb3d_rl.assets.folders import find_folders
+    from fb3d_rl.children import withheld, worker_pool
+    from fb3d_rl.errors import UserError
+    from fb3d_rl.evaluation import likeness
+    from fb3d_rl.files import write_text
+
+    if options.workers < 1:
+        raise UserError(f"--workers {options.workers} is too small; give 1 or more")
+    kinds = [list(find_folders(folder).values()) for folder in (options.dir, options.other)]
+    described: list[dict[str, list[Any]]] = [{}, {}]
+    with worker_pool(options.workers) as pool:
+        with withheld():
+            found = pool.map(likeness.of_folder, [*kinds[0], *kinds[1]])
+        for i, (category, numbers) in enumerate(track(found, "objects", sum(map(len, kinds)))):
+            described[i >= len(kinds[0])].setdefault(category, []).append(numbers)
+    compared = likeness.compare(described[0], described[1])
+    if not compared:
+        raise UserError(
+            f"no category has {likeness.FEWEST} objects both in {options.dir} and in {options.other}; give more objects"
+        )
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ("category", "objects", "told apart", "what tells them best: mean of DIR, of OTHER (by itself)"):
+        table.add_column(name, overflow="fold")
+    for item in compared:
+        telling = [
+            f"{likeness.FEATURES[i]}: {item.means[i][0]:.2f}, {item.means[i][1]:.2f} ({item.apart[i]:.0%})"
+            for i in item.telling()
+        ]
+        table.add_row(item.category, "{} / {}".format(*item.counts), f"{item.told:.0%}", "\n".join(telling))
+    Console().print(table)
+    print("Told apart: of all pairs, one object of each kind, those that a classifier orders rightly; 50 % is chance.")
+    if options.out:
+        content = {"features": likeness.FEATURES, "categories": [asdict(item) for item in compared]}
+        write_text(options.out, json.dumps(content, indent=1) + "\n")
+
+
 COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "generate": generate,
     "unpack": unpack,
     "list": listing,
     "validate": validate,
     "preview": preview,
+    "compare": compare,
 }
 
 if __name__ == "__main__":
