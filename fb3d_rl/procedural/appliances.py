@@ -34,7 +34,7 @@ def refrigerator(rng: np.random.Generator) -> ObjectSpec:
             legs=rng.uniform(0.02, 0.06) if rng.random() < 0.6 else 0.0,
             leg_kind="plinth" if rng.random() < 0.5 else "rods",
             door="door",
-            free_swing=(1.5, 2.2),
+            free_swing=(1.5, 3.1),
         ),
     )
     return ObjectSpec("Refrigerator", "heavy", "refrigerator_body", tuple(body), tuple(parts))
@@ -84,7 +84,7 @@ def safe(rng: np.random.Generator) -> ObjectSpec:
             legs=rng.uniform(0.02, 0.06) if rng.random() < 0.5 else 0.0,
             leg_kind="rods",
             door="door",
-            free_swing=(1.4, 2.2),
+            free_swing=(1.4, 3.1),
         ),
     )
     return ObjectSpec("Safe", "heavy", "safe_body", tuple(body), (_with_dial(rng, door),))

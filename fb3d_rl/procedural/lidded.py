@@ -30,7 +30,7 @@ def kitchen_pot(rng: np.random.Generator) -> ObjectSpec:
     ]
     body += _pot_handles(rng, kind, (foot, radius), height, reach, thickness)
     lid = _pot_lid(rng, rim, (foot, radius), height, thickness, clearance, dome, knob)
-    parts = (Part("lid", "slider", (0, 1, 0), rng.uniform(0.3, 0.6), tuple(lid)),)
+    parts = (Part("lid", "slider", (0, 1, 0), rng.uniform(0.04, 0.6), tuple(lid)),)
     return ObjectSpec("KitchenPot", "free", "pot_body", tuple(body), parts)
 
 
@@ -273,5 +273,5 @@ def laptop(rng: np.random.Generator) -> ObjectSpec:
         *around("screen_frame", x, y, (z[0], front), inside, lying=True),
         box("screen", inside[0], field, inside[1]),
     ]
-    parts = (Part("screen", "hinge", (-1, 0, 0), rng.uniform(1.6, 2.2), tuple(pieces), (0.0, bottom, z[0])),)
+    parts = (Part("screen", "hinge", (-1, 0, 0), rng.uniform(1.6, 2.9), tuple(pieces), (0.0, bottom, z[0])),)
     return ObjectSpec("Laptop", "free", "laptop_base", tuple(body), parts)

@@ -84,6 +84,7 @@ def test_a_run_folder_in_use_is_left_alone(launch: Launch, tmp_path: Path) -> No
 
 def test_evaluation_without_a_checkpoint_is_refused(launch: Launch, tmp_path: Path) -> None:
     assert "checkpoint" in sentence_of(launch("evaluate.py", "policy=artflownet", cwd=tmp_path))
+    assert "assets.split" in sentence_of(launch("evaluate.py", "assets.eval_split=[Box]", cwd=tmp_path))
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
