@@ -173,14 +173,16 @@ def _ribs(rng: np.random.Generator, radius: float, mouth: float, collar: float) 
     """What fingers hold on to: ribs all around, two wings, or nothing."""
     kind = rng.choice(["ribs", "wings", "none"], p=[0.5, 0.25, 0.25])
     low, high = collar + CLEAR + 0.5 * (mouth - collar), mouth + 0.03
+    within = radius - 0.018  # the thinnest skirt is 0.02 thick
     if kind == "ribs":
         count, size = int(rng.integers(6, 13)), 0.05 * radius + 0.006
         angles = 2 * np.pi * np.arange(count) / count
-        spots = [(0.98 * radius * float(np.cos(a)), 0.98 * radius * float(np.sin(a))) for a in angles]
+        at = max(0.98 * radius, within + size)
+        spots = [(at * float(np.cos(a)), at * float(np.sin(a))) for a in angles]
         return [rod("lid_rib", (x, low, z), (x, high, z), size, sides=6) for x, z in spots]
     if kind == "wings":
-        thin, inside, reach = 0.12 * radius + 0.01, 0.9 * radius, radius + rng.uniform(0.04, 0.15)
-        return [box("handle", x, (low, high), (-thin, thin)) for x in ((-reach, -inside), (inside, reach))]
+        thin, reach = 0.12 * radius + 0.01, radius + rng.uniform(0.04, 0.15)
+        return [box("handle", x, (low, high), (-thin, thin)) for x in ((-reach, -within), (within, reach))]
     return []
 
 
