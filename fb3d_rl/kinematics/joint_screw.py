@@ -110,8 +110,9 @@ def screw_of_projection(points: Tensor, flow: Tensor, projection: Tensor, part: 
 
     Returns:
         The screw, and its residual [B] in [0, 1]: the sine of the angle between f and the screw's flow as vectors of
-        all of the part's points. It is 0 for a perfect prediction and 1 for a cloud without flow. A flow that also runs
-        along the axis, as that of a thread, leaves a residual, too.
+        all of the part's points. It is 0 for a perfect prediction and 1 for a cloud without flow. Of a cap on a thread
+        that is seen all around, the axis is found, and the residual is the sine of the thread's angle; of one seen from
+        one side, the axis is tilted towards it.
     """
     p, f, r = (x.masked_fill(~part[..., None], 0.0).double() for x in (points, flow, projection))
     size = length(f)

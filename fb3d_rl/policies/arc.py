@@ -25,6 +25,9 @@ from fb3d_rl.policies.touch import TouchPolicy
 
 FLOW, PROJECTION, TWIST = ("prediction", "flow"), ("prediction", "projection"), ("prediction", "twist")
 
+LOOKS = ("next", "arc", "looks")
+"""How often a policy has looked in an episode, [E, 1]."""
+
 
 class ArcFlow(Policy):
     """The flow of a look, or of the arc that the last look has found.

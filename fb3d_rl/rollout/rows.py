@@ -68,6 +68,8 @@ class TrialRow:
             was not recorded.
         held_opened: at some time a part that suction had held was open, by the same rule from its own start: the target
             or, where suction holds any part, another one.
+        network_calls: how often a policy that follows arcs called its network (:mod:`fb3d_rl.policies.arc`); -1 for
+            other policies, which call theirs in each step, or if it was not recorded.
 
     Raises:
         ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success, an
@@ -99,6 +101,7 @@ class TrialRow:
     policy_digest: str = ""
     mask: str = ""
     held_opened: bool = False
+    network_calls: int = -1
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):
