@@ -7,8 +7,6 @@ camera sees is not used.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
@@ -32,7 +30,8 @@ LOOKS = ("next", "arc", "looks")
 class ArcFlow(Policy):
     """The flow of a look, or of the arc that the last look has found.
 
-    An arc is followed if its screw explains the flow from which it comes; else there is a look in each step.
+    An arc is followed if its screw explains the flow from which it comes; else there is a look in each step. While the
+    hand hides all of the part there is none, and the arc goes on.
 
     Args:
         look: reads observations; writes ("prediction", "flow") and ("prediction", "projection") [E, N, 3].
@@ -49,7 +48,7 @@ class ArcFlow(Policy):
         super().__init__()
         self.look, self.options = look, options
         read = [("observation", key) for key in ("points", "valid", "part_mask", "attached")]
-        state = [("arc", *key) if isinstance(key, tuple) else ("arc", key) for key in _start(torch.Size([1])).keys()]
+        state = [("arc", field) for field in ("revolute", "axis", "origin", "age", "looks")]
         self.in_keys = list(dict.fromkeys([*read, *look.in_keys, ("policy", "phase"), *state]))
         self.out_keys = [FLOW, TWIST, *(("next", *key) for key in state)]
 
@@ -68,7 +67,7 @@ class ArcFlow(Policy):
         if self.options.look_every is not None:
             due = due | (age >= self.options.look_every)
         chooses = ~held & ((phase == SELECT) | (phase == RETREAT))
-        looks = (chooses | (held & (~pulls | due))).squeeze(-1)
+        looks = (chooses | (held & (~pulls | due))).squeeze(-1) & part.any(-1)
         screw = JointScrew(state["revolute"].squeeze(-1).clone(), held * state["axis"], state["origin"].clone())
         flow = flow_of_screw(screw, obs["points"], part)
         if bool(looks.any()):
@@ -89,9 +88,10 @@ class ArcFlow(Policy):
 
 
 def _start(batch: torch.Size) -> TensorDict:
-    start: dict[str, Any] = {key: torch.zeros(*batch, 1, dtype=torch.int64) for key in ("age", "looks")}
+    start = {key: torch.zeros(*batch, 1, dtype=torch.int64) for key in ("age", "looks")}
     start |= {key: torch.zeros(*batch, 3) for key in ("axis", "origin")}
-    return TensorDict({"revolute": torch.zeros(*batch, 1, dtype=torch.bool), **start}, batch_size=batch)
+    start["revolute"] = torch.zeros(*batch, 1, dtype=torch.bool)
+    return TensorDict(start, batch_size=batch)
 
 
 def _twist(screw: JointScrew) -> Tensor:
