@@ -81,12 +81,14 @@ REGISTRY = {
         {"": Access(EXPERT, truth=(FLOW,)), WITHOUT_MASK: Access(EXPERT, mask=False, truth=(FLOW,))},
         act="fb3d_rl.policies.flow_policy:expert_policy",
     ),
+    "expert_arc": Entry({"": Access(EXPERT, truth=(FLOW,))}, act="fb3d_rl.policies.arc:expert_arc_policy"),
     "artflownet": Entry(
         {"": NOTHING, WITHOUT_MASK: Access("nothing", mask=False)},
         algorithm="fb3d_rl.algos.artflownet:ALGORITHM",
         options=FITTED,
         joint_fit=True,
     ),
+    "flowbotpp": Entry({"": NOTHING}, algorithm="fb3d_rl.algos.flowbotpp:ALGORITHM", options=FITTED),
     "screwnet": Entry({"": NOTHING}, algorithm="fb3d_rl.algos.screwnet:ALGORITHM", options=FITTED),
     "ump_di": Entry(
         {

@@ -49,6 +49,7 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
     ("train", "experiment/partnet_long"): ["assets.root=."],
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/flowbotpp"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/ump_di"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
@@ -78,7 +79,7 @@ def groups_of(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    further = ("random", "normal", "screwnet", "ump_di", "bc", "dagger")
+    further = ("random", "normal", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
     other |= {("view", f"policy/{name}") for name in further}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
@@ -467,6 +468,8 @@ def test_what_the_live_page_cannot_do_is_named(override: str, word: str) -> None
     [
         ("train", ["algo=bc"]),
         ("train", ["algo=screwnet"]),
+        ("train", ["algo=flowbotpp"]),
+        ("evaluate", ["policy=expert_arc"]),
         ("evaluate", ["policy=normal"]),
         ("evaluate", ["policy=dagger", "checkpoint=x.pt"]),
         ("evaluate", ["policy=ump_di", "checkpoint=x.pt"]),

@@ -54,6 +54,7 @@ POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
     },
     "artflownet": lambda: trained("artflownet", MASKED),
     "artflownet, policy.mask=none": lambda: trained("artflownet", MASKLESS, part_mask_input=False),
+    "flowbotpp": lambda: trained("flowbotpp", MASKED),
     "screwnet": lambda: trained("screwnet", MASKED),
     "ump_di": lambda: trained("ump_di", MASKED),
     "bc, dagger": lambda: learned("none", False),

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fb3d_rl.algos.flow_network import FlowNetwork
-from fb3d_rl.kinematics.joint_screw import JointScrew, screw_of_flow
+from fb3d_rl.kinematics.joint_screw import UNEXPLAINED, JointScrew, screw_of_flow
 from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.training.device import products_of
 from fb3d_rl.training.draws import augment
@@ -18,9 +18,6 @@ from fb3d_rl.training.options import FitOptions
 
 if TYPE_CHECKING:
     from tensordict import TensorDictBase
-
-UNEXPLAINED = 0.05
-"""Largest residual (root mean square) of a flow that one screw explains; flows of several joints leave more."""
 
 NARROW = 0.05
 """Smallest size (m) of a part to which an error of the axis' position is relative."""

@@ -85,6 +85,8 @@ PULLS = Metric("pulls_until_moved", "pulls until the part moved the right way", 
 """Over the parts that did."""
 EFFORT = (STEPS, SECONDS, PATH, LOST, PULLS)
 """The effort of trials; rows of earlier versions lack these numbers."""
+CALLS = Metric("network_calls", "calls of the network", "calls", bounds=_POSITIVE, decimals=1)
+"""Of policies that follow arcs; others call their network in each step."""
 DECISION = Metric("time/decision_ms", "wall time of a decision, ms", "ms", decimals=1)
 """Median over the decisions of a run, on the machine that it ran on; rows do not hold it."""
 
@@ -106,6 +108,7 @@ _VALUES: dict[str, Callable[[Any], float | None]] = {
     "path_length": lambda row: row.path_length if row.path_length >= 0 else None,
     "times_lost": lambda row: float(row.lost) if row.lost >= 0 else None,
     "pulls_until_moved": lambda row: float(row.pulls) if row.pulls >= 0 else None,
+    "network_calls": lambda row: float(row.network_calls) if row.network_calls >= 0 else None,
 }
 """What a row contributes to each metric; None: this row does not count."""
 
@@ -182,8 +185,9 @@ def _aggregate(rows: Sequence[TrialRow], flow: Sequence[FlowRow], own: str | Non
             "n_objects": len({(row.category, row.object) for row in of_policy}),
             "n_error": sum(row.status == "error" for row in of_policy),
         }
-        further = (HELD,) if any(row.mask == "none" for row in of_policy) else ()
-        measured = _measure(of_policy, TRIAL + further + EFFORT, "", classes) | counts
+        further = [HELD] if any(row.mask == "none" for row in of_policy) else []
+        further += [CALLS] if any(row.network_calls >= 0 for row in of_policy) else []
+        measured = _measure(of_policy, (*TRIAL, *further, *EFFORT), "", classes) | counts
         if policy == own:
             out |= measured
         out |= {f"{policy}/{key}": value for key, value in measured.items()}
@@ -211,7 +215,7 @@ def summary(
 
     Returns:
         A flat dict. Each metric m of :data:`FLOW`, :data:`TRIAL` and :data:`EFFORT` (and :data:`HELD`, of policies that
-        see no part mask) has the keys "m" (instance mean),
+        see no part mask, and :data:`CALLS`, of those that follow arcs) has the keys "m" (instance mean),
         "m_ci95" ([lo, hi] or None), "m_class_mean" and "m_class_mean_ci95". Trial metrics and the counts "n"
         (scheduled trials), "n_objects" and "n_error" stand there for the run's own policy, and once more as
         "<policy>/..." for every policy. "by_category" (without class means) and, for more than one split,

@@ -127,7 +127,7 @@ def flow_at_tip(state: FlowState, seen: Observed, control: Control) -> Tensor:
 
     The flow of a rigid part is v + omega x r. Both are fitted to the visible points (weighted least squares), the near
     ones foremost: the hand often hides those around the held point. Without a mask what has a flow may belong to
-    several parts, so that only what is near counts.
+    several parts, so that only what is near counts. Where the part's twist is known, nothing is fitted.
     """
     o, tip = control.options, seen.tip.to(seen.points)
     squared = squared_distances(seen.points, tip[:, None]).squeeze(-1)
@@ -137,6 +137,11 @@ def flow_at_tip(state: FlowState, seen: Observed, control: Control) -> Tensor:
         weight = (seen.part & seen.valid) / (1.0 + squared / o.nearby**2)
     fitted = rigid_motion(seen.points, seen.flow, weight, tip, 1e-2 * o.nearby**2)
     velocity, omega = (x.double() for x in fitted)
+    if seen.twist is not None:
+        linear, turn = seen.twist.split(3, -1)
+        known = seen.twist.any(-1, keepdim=True)
+        velocity = torch.where(known, linear + torch.linalg.cross(turn, seen.tip), velocity)
+        omega = torch.where(known, turn, omega)
     speed, unit = length(velocity), normalize(velocity)
     rate = seen.sense * o.lead * control.limits.period * o.pull_speed / speed.clamp_min(1e-6) * omega
     return torch.where(speed > 1e-6, normalize(unit + torch.linalg.cross(rate, unit)), state.pull)

@@ -61,6 +61,8 @@ class FlowPolicy(Policy):
         limits: what an action means.
         options: speeds, gains, distances and times.
         pull_key: where the tip's velocity [E, 3] (m/s) in a pull is read; unless given, it follows from the flow.
+        twist_key: where the part's motion [E, 6] is read, which a pull follows in place of the visible flow: velocity
+            of the world's origin and angular velocity, of any scale; 0 where it is not known.
 
     Shapes: reads the contract's "observation" group and the flow [E, N, 3]; writes ``action`` [E, 8] and the next
     step's state (:class:`~fb3d_rl.policies.flow_state.FlowState`) under ``("next", "policy")``.
@@ -72,9 +74,10 @@ class FlowPolicy(Policy):
         limits: VelocityLimits,
         options: FlowPolicyOptions | None = None,
         pull_key: tuple[str, str] | None = None,
+        twist_key: tuple[str, str] | None = None,
     ) -> None:
         super().__init__()
-        self.flow_key, self.pull_key = flow_key, pull_key
+        self.flow_key, self.pull_key, self.twist_key = flow_key, pull_key, twist_key
         self.limits = limits
         self.options = options or FlowPolicyOptions()
         self._control = Control(self.options, limits)
@@ -82,7 +85,7 @@ class FlowPolicy(Policy):
         observed = ("points", "valid", "qpos", "tool_pose", "attached", "contact_force", "camera_position")
         self.in_keys = [("observation", key) for key in (*observed, "goal_sense")] + [flow_key]
         self.in_keys += [MASK] if self.options.mask == "target" else []
-        self.in_keys += [] if pull_key is None else [pull_key]
+        self.in_keys += [key for key in (pull_key, twist_key) if key is not None]
         self.in_keys += [("policy", key) for key in state]
         self.out_keys = ["action"] + [("next", "policy", key) for key in state]
 
@@ -109,6 +112,7 @@ class FlowPolicy(Policy):
             flow=tensordict[self.flow_key],
             camera=obs["camera_position"],
             pull=None if self.pull_key is None else tensordict[self.pull_key].double(),
+            twist=None if self.twist_key is None else tensordict[self.twist_key].double(),
         )
         state, velocity = command(advance(state, seen, self._control), seen, self._control)
         axis = above_ground(state.standoff, seen.tip, self.options.clearance)

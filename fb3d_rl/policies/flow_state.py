@@ -140,6 +140,8 @@ class Observed:
         flow: [E, N, 3].
         camera: [E, 3] m.
         pull: [E, 3] velocity of the tip in a pull, m/s; None if it follows from the flow.
+        twist: [E, 6] velocity of the world's origin and angular velocity of the part, 0 where they are not known; None
+            if they follow from the flow.
     """
 
     phase: Tensor
@@ -154,6 +156,7 @@ class Observed:
     flow: Tensor
     camera: Tensor
     pull: Tensor | None = None
+    twist: Tensor | None = None
 
     def __getitem__(self, rows: Tensor) -> Observed:
         """Some of the environments, by a mask [E] bool."""

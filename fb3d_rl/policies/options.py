@@ -123,6 +123,25 @@ class TouchOptions:
 
 
 @dataclass(frozen=True)
+class ArcOptions:
+    """How the arcs of policy=flowbotpp and expert_arc are followed, see fb3d_rl.policies.arc."""
+
+    look_every: int | None = option(
+        10,
+        "while the part is held, the network is called once in this many steps, and the tip follows an arc in between; "
+        "null: once for each hold (open loop)",
+        "control steps",
+        "[1, inf)",
+    )
+    residual: float = option(
+        0.4,
+        "largest residual (sine of the angle between the predicted flow and that of the arc) at which the arc is "
+        "followed; beyond, the tip follows the flow, which is predicted in each step",
+        within="[0, 1]",
+    )
+
+
+@dataclass(frozen=True)
 class FlowPolicyOptions:
     """How the flow policy moves; ``mask`` and ``contact`` are set from their own keys."""
 
@@ -208,6 +227,7 @@ class FlowPolicyOptions:
     )
     learn: bool = option(True, "whether the flow that a network predicts is corrected by what its pulls measure")
     touch: TouchOptions = group(TouchOptions)
+    arc: ArcOptions = group(ArcOptions)
     mask: Literal["target", "none"] = "target"
     contact: ContactOptions = ContactOptions()
 

@@ -70,6 +70,8 @@ class TrialRow:
             or, where suction holds any part, another one.
         pulls: how many pulls began until the part had moved the right way
             (:func:`fb3d_rl.rollout.pulls.pulls_until_moved`); -1 if it never did, or if it was not recorded.
+        network_calls: how often a policy that follows arcs called its network (:mod:`fb3d_rl.policies.arc`); -1 for
+            other policies, which call theirs in each step, or if it was not recorded.
 
     Raises:
         ValueError: a normalized distance that is not finite, or a crashed trial that claims contact, success, an
@@ -102,6 +104,7 @@ class TrialRow:
     mask: str = ""
     held_opened: bool = False
     pulls: int = -1
+    network_calls: int = -1
 
     def __post_init__(self) -> None:
         if self.status not in ("ok", "error"):

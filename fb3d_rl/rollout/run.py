@@ -17,6 +17,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import Key
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import make_env
+from fb3d_rl.policies.arc import LOOKS
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import MASK
 from fb3d_rl.policies.hand import VelocityLimits
@@ -47,8 +48,9 @@ KEYS: tuple[Key, ...] = (
     ("next", "held_opened"),
     ("next", "observation", "attached"),
     ("next", "observation", "contact_force"),
+    LOOKS,
 )
-"""The entries of the frames that a row is computed from."""
+"""The entries of the frames that a row is computed from; the last one is there for policies that follow arcs."""
 
 
 def state_of(policy: TensorDictModuleBase) -> TensorDict:
@@ -185,6 +187,7 @@ def _outcome(frames: TensorDictBase, control_freq: int) -> dict[str, Any]:
         held_opened=bool(after["held_opened"].any()),
         lost=int((attached[:-1] & ~attached[1:]).sum()),
         pulls=pulls_until_moved(tips, attached, distance),
+        network_calls=int(frames.get(LOOKS, torch.tensor([-1])).flatten()[-1]),
     )
 
 

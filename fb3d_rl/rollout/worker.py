@@ -54,7 +54,7 @@ class EpisodeCollector(Collector):
         return os.getpid()
 
     def episode(self, trial: object, keys: Sequence[Key] | None) -> TensorDictBase | str:
-        """Frames [T] of the trial, those ``keys`` alone if given, or the error that ended it."""
+        """Frames [T] of the trial, those of ``keys`` that there are alone if given, or the error that ended it."""
         self.env.set_trials([trial])
         try:
             with steady_floats(), set_exploration_type(self.exploration_type), torch.no_grad():
@@ -65,7 +65,7 @@ class EpisodeCollector(Collector):
         except (Exception, SystemExit) as error:  # a policy's library may want to end the process
             log.exception("%s: the trial crashed", trial)
             return f"{type(error).__name__}: {error}"
-        return frames if keys is None else frames.select(*keys)
+        return frames if keys is None else frames.select(*keys, strict=False)
 
 
 class WorkerDied(Exception):

@@ -1,4 +1,4 @@
-"""What flow samples train besides ArtFlowNet: screws and directions; what they learn, and their runs in small."""
+"""What flow samples train besides ArtFlowNet: projections, screws, directions; what is learned, and runs in small."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl.algos.flow_network import FlowNetwork
+from fb3d_rl.algos.flowbotpp import flowbotpp_objective
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.run import run_training as run
 from fb3d_rl.algos.screwnet import screw_loss, screw_objective
@@ -22,9 +23,16 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.data.samples import SampleOptions, draw_sample
 from fb3d_rl.errors import UserError
-from fb3d_rl.kinematics.joint_screw import screw_of_flow
+from fb3d_rl.kinematics.joint_screw import (
+    JointScrew,
+    flow_of_screw,
+    projection_of_flow,
+    screw_of_flow,
+    screw_of_projection,
+)
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.models.flowbotpp import FlowProjectionNet
 from fb3d_rl.models.screwnet import ScrewNet
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
@@ -39,7 +47,7 @@ Config = Callable[[str, list[str]], Any]
 KINDS: dict[str, FlowNetwork] = {
     name: behind(entry.algorithm) for name, entry in REGISTRY.items() if entry.options == REGISTRY["artflownet"].options
 }
-BASELINES = ["screwnet", "ump_di"]
+BASELINES = ["flowbotpp", "screwnet", "ump_di"]
 GIVEN_CONTACT = {"ump_di"}
 """Policies of networks that may read the true flow, for where to touch."""
 SMALL = [
@@ -95,6 +103,44 @@ def test_screwnet_learns_one_cloud(door: TensorDictBase) -> None:
     assert net.screw(*observed).revolute.all()
     nothing = net(observed[0], observed[1], torch.zeros_like(observed[2]))
     assert not nothing.any(), "no part, no flow"
+
+
+def test_flow_and_projection_are_learned_on_one_cloud(door: TensorDictBase) -> None:
+    net, numbers = learned("flowbotpp", door)
+    assert numbers["cosine"] > 0.99 and numbers["projection_error"] < 0.05
+    assert isinstance(net, FlowProjectionNet)
+    points, valid, part = (door["observation", key] for key in ("points", "valid", "part_mask"))
+    found, residual = screw_of_projection(points, *net.motions(points, valid, part), part)
+    true, _ = screw_of_flow(points, door["privileged", "flow"], part)
+    assert found.revolute.all() and residual.max() < 0.1
+    assert (found.axis * true.axis).sum(-1).min() > 0.99, "within 8 degrees"
+
+
+def loss_of(flow: torch.Tensor, projection: torch.Tensor, samples: TensorDictBase) -> float:
+    """The loss of a network that answers with ``flow`` and ``projection``."""
+    net = network("flowbotpp")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(net, "motions", lambda *_: (flow, projection))
+        return float(flowbotpp_objective(net, OPTIONS)(samples, 0))
+
+
+def test_the_loss_of_flow_and_projection_counts_what_is_wrong(door: TensorDictBase) -> None:
+    points, valid, part = (door["observation", key] for key in ("points", "valid", "part_mask"))
+    flow = door["privileged", "flow"]
+    projection, turns = projection_of_flow(points, flow, part)
+    assert turns.all() and not projection[~part].any()
+    assert loss_of(flow, projection, door) == 0.0
+    everywhere = torch.tensor([0.0, 0.0, 0.1])
+    assert loss_of(flow + everywhere, projection, door) == pytest.approx(0.01)
+    share = float(part.sum() / valid.sum())
+    assert 0.1 < share < 0.9
+    assert loss_of(flow, projection + everywhere, door) == pytest.approx(0.01 * (1 + share))
+    off_part = projection + everywhere * ~part[..., None]
+    assert loss_of(flow, off_part, door) == 0.0, "a projection counts on the part only"
+    drawer = door.clone()
+    slides = JointScrew(torch.zeros(2, dtype=torch.bool), torch.tensor([[1.0, 0, 0]]).expand(2, 3), torch.zeros(2, 3))
+    drawer["privileged", "flow"] = flow_of_screw(slides, points, part)
+    assert loss_of(drawer["privileged", "flow"], projection, drawer) == 0.0, "what slides has none"
 
 
 def test_directions_are_learned_on_one_cloud(door: TensorDictBase) -> None:

@@ -115,6 +115,9 @@ def test_what_it_took_counts_the_trials_that_it_is_about() -> None:
     early = summary([trial("Oven", "a", False)], [])  # recorded before these numbers were
     assert early["path_length"] is early["times_lost"] is early["pulls_until_moved"] is None
     assert early["seconds_to_success"] is None
+    assert "network_calls" not in numbers
+    calls = summary([trial("Oven", "a", True, network_calls=2), trial("Oven", "b", True, network_calls=5)], [])
+    assert calls["network_calls"] == calls["artflownet/network_calls"] == 3.5
     with Console(width=100, record=True, file=io.StringIO()) as console:
         show(early, console)
     assert "What it took" not in console.export_text()

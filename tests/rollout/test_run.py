@@ -25,6 +25,7 @@ from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, default_trial
 from fb3d_rl.env.torchrl_env import make_env
 from fb3d_rl.kinematics.opening import openable_links
+from fb3d_rl.policies.arc import LOOKS
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 from fb3d_rl.rollout.collectors import CollectorOptions
@@ -311,8 +312,11 @@ def test_why_trials_fail() -> None:
     }.items():
         assert _outcome(episode, control_freq=20)["failure"] == expected
     blinking = [k % 10 > 4 for k in range(40)]
-    outcome = _outcome(frames(slowly, held, blinking), control_freq=20)
-    assert outcome["lost"] == 3 and outcome["seconds"] == 2.0
+    episode = frames(slowly, held, blinking)
+    outcome = _outcome(episode, control_freq=20)
+    assert outcome["lost"] == 3 and outcome["seconds"] == 2.0 and outcome["network_calls"] == -1
+    episode[LOOKS] = torch.arange(40)[:, None] // 10
+    assert _outcome(episode, control_freq=20)["network_calls"] == 3
     assert outcome["path_length"] == pytest.approx(0.4)
 
 
