@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.cloud_network import CloudNetwork
-from fb3d_rl.perception.arrays import as_mask, as_points, near_origin, nearest
+from fb3d_rl.perception.arrays import as_mask, as_points, draw, near_origin, nearest
 from fb3d_rl.places import folder
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])
@@ -185,7 +185,7 @@ class ArtFlowNet(CloudNetwork):
         rows = valid.nonzero().flatten()
         if len(rows) <= LARGEST:
             return self._dealt(cloud, mask)
-        drawn = torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:LARGEST].to(cloud.device)
+        drawn = draw(len(rows), LARGEST).to(cloud.device)
         kept = rows[drawn]
         found = self._dealt(cloud[kept], mask[kept])
         near = nearest(cloud[rows], cloud[kept], mask[rows], mask[kept]).to(cloud.device)

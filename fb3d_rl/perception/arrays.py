@@ -143,6 +143,15 @@ def near_origin(cloud: Tensor) -> tuple[Tensor, Tensor]:
     return cloud.float().masked_fill(far[:, None], torch.nan), origin
 
 
+def draw(count: int, most: int) -> Tensor:
+    """The places [n] int64 of at most so many of ``count`` points, drawn at random, always alike; all, in their order,
+    if they are no more.
+    """
+    if count <= most:
+        return torch.arange(count)
+    return torch.randperm(count, generator=torch.Generator().manual_seed(0))[:most]
+
+
 def nearest(points: Tensor, kept: Tensor, marked: Tensor, kept_marked: Tensor) -> Tensor:
     """For each point the index of about the nearest of the kept points that is marked alike, if there is one.
 
