@@ -128,7 +128,7 @@ def _one(cloud: Path, beside: Path, net: Any, checkpoint: str, settings: dict[st
     about = {"cloud": str(cloud), "checkpoint": checkpoint, "reading": list(file.remarks)}
     results.write_json(beside.with_name(f"{beside.name}.json"), found, **about)
     write_page(beside.with_name(f"{beside.name}.html"), found, cloud, file.remarks)
-    return f"{sentence(found)}; wrote {beside}.html, .json, .npz and .flow.ply"
+    return f"{sentence(found, file.remarks)}; wrote {beside}.html, .json, .npz and .flow.ply"
 
 
 def _names(clouds: Sequence[Path]) -> list[str]:

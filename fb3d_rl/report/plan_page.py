@@ -23,12 +23,12 @@ COLORS = {"object": "#98a2b3", "left out": "#cbb79b", "part": "#3b7dd8", "flow":
 """Of what a figure shows."""
 
 
-def sentence(plan: Plan) -> str:
-    """What a plan says, in one sentence."""
+def sentence(plan: Plan, remarks: Sequence[str] = ()) -> str:
+    """What a plan says, and what was recognised and guessed (``remarks`` in the file), in one sentence."""
     best = plan.hypotheses[0]
     point, pull, before = (_triple(x) for x in (best.contact_point, best.pull, best.precontact_point))
     sure = f" (probability {best.probability:.0%} of {len(plan.hypotheses)})" if len(plan.hypotheses) > 1 else ""
-    guessed = f"; {'; '.join(plan.remarks)}" if plan.remarks else ""
+    guessed = "".join(f"; {remark}" for remark in (*remarks, *plan.remarks))
     return f"touch {point} m, coming from {before} m, and pull along {pull}{sure}{guessed}"
 
 
@@ -50,7 +50,7 @@ def write_page(path: Path, plan: Plan, cloud: Path, remarks: Sequence[str]) -> N
     shown.append(Picker("mask=box:"))
     best = plan.hypotheses[0]
     facts = [(name.replace("_", " "), f"{_numbers(getattr(best, name))}  {UNITS[name]}") for name in VECTORS]
-    header: list[Block] = [Note(sentence(plan)), *(Note(remark) for remark in remarks)]
+    header: list[Block] = [Note(sentence(plan, remarks))]
     sections = [Section("Flow and contact", shown), Section("Plan, in the frame of the cloud", [Facts(facts)])]
     write(path, f"Plan for {cloud.name}", f"How to open {cloud.name}", header, sections)
 
