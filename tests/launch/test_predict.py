@@ -108,7 +108,8 @@ def test_a_broken_cloud_stops_no_other(
     [
         (["out=x"], "no cloud"), (["a.npy", "colour=red"], "colour= is unknown"), (["a.npy", "tilt=much"], "tilt=much"),
         (["a.npy", "up=1,2"], "3 numbers"), (["a.npy", "scale=-1"], "scale=-1"),
-        (["a.npy", "foreground=no"], "true, false"), (["a.npy", "camera=here"], "camera=here"), (["a.npy", "checkpoint=nowhere.pt"], "nowhere.pt"),
+        (["a.npy", "foreground=no"], "true, false"), (["a.npy", "camera=here"], "camera=here"),
+        (["a.npy", "checkpoint=nowhere.pt"], "nowhere.pt"),
         (["a.npy", "out=a.npy"], "is a file"), (["a.npy", "mask=nothing"], "mask=nothing"),
     ],
 )  # fmt: skip
