@@ -155,16 +155,8 @@ def plan(
     flows[:, inside] = found.cpu()
     grasps = [_grasp(scene, world, inside, part, flow, tool_pose, origin, options) for flow in flows]
 
-    # From the kept points to all, and from the world's axes to the cloud's.
     turned = flows if np.array_equal(scene.turn, np.eye(3)) else (flows.double() @ torch.from_numpy(scene.turn)).float()
-    sides = torch.zeros(len(given), dtype=torch.bool) if marked is None else marked
-    source = torch.arange(len(rows))
-    if len(kept) < len(rows):
-        source = nearest(near[rows], near[kept], sides[rows], sides[kept])
-    everywhere = torch.zeros(len(flows), len(given), 3)
-    everywhere[:, rows] = turned[:, source]
-    shown = torch.zeros(len(given), dtype=torch.bool)
-    shown[rows] = inside[source]
+    everywhere, shown = _to_all(turned, inside, near, rows, kept, marked)
     hypotheses = tuple(
         replace(grasp, probability=float(p), flow=flow.numpy())
         for grasp, p, flow in zip(grasps, probabilities, everywhere, strict=True)
@@ -174,6 +166,33 @@ def plan(
     stood = scene.turn.T @ scene.camera + scene.base + origin.double().numpy()
     all_marked = None if marked is None else marked.numpy()
     return Plan(given.numpy(), shown.numpy(), all_marked, hypotheses, pose, stood, scale, tuple(remarks))
+
+
+def _to_all(
+    flows: Tensor, inside: Tensor, near: Tensor, rows: Tensor, kept: Tensor, marked: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """From the kept points to all.
+
+    Args:
+        flows: [K, n, 3] of the kept points.
+        inside: [n] bool, likewise.
+        near: [N, 3] all points.
+        rows: places of those that are measured.
+        kept: [n] places of the kept points among all, n = len(rows) if they are the measured ones.
+        marked: [N] bool, on the part.
+
+    Returns:
+        Flows [K, N, 3] and inside [N] bool.
+    """
+    source = torch.arange(len(rows))
+    if len(kept) < len(rows):
+        sides = torch.zeros(len(near), dtype=torch.bool) if marked is None else marked
+        source = nearest(near[rows], near[kept], sides[rows], sides[kept])
+    everywhere = torch.zeros(len(flows), len(near), 3)
+    everywhere[:, rows] = flows[:, source]
+    shown = torch.zeros(len(near), dtype=torch.bool)
+    shown[rows] = inside[source]
+    return everywhere, shown
 
 
 def _grasp(

@@ -132,7 +132,7 @@ def test_every_format_gives_the_same_cloud(tmp_path: Path, name: str) -> None:
 def test_other_readers_find_the_same(tmp_path: Path, name: str) -> None:
     file, content = FORMATS[name]
     path = tmp_path / file.lower()
-    path.write_bytes(content)
+    path.write_bytes(content.replace(b"  ", b" ") if "ascii" in name else content)  # pypcd4 takes single spaces only
     if path.suffix == ".ply":
         import trimesh
 
