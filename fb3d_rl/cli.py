@@ -14,6 +14,7 @@ COMMANDS = {
     "evaluate": "evaluate a policy",
     "objects": "generate, check, list, preview or unpack objects",
     "demos": "record, replay, list, filter, convert or collect demonstrations",
+    "predict": "flow, contact point and gripper pose of a cloud of your own",
     "report": "the page of a run, or of a comparison of several",
     "view": "the live page: an object, its flow, and the gripper",
     "benchmark": "throughput beside others, measured in one run",

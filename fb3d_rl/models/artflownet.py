@@ -16,12 +16,16 @@ from torch import Tensor, nn
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.perception.arrays import as_mask, as_points, draw, near_origin, nearest
 from fb3d_rl.places import folder
 
 Cloud = TypeVar("Cloud", Tensor, NDArray[np.float32])
 
 POINTS = 1200
 """Points of the clouds that networks are trained on (contract), so that balls hold as many as they did then."""
+
+LARGEST = 16 * POINTS
+"""Points of the largest cloud of which each gets a flow of its own, as many as a depth image of 160 x 120 has."""
 
 PRETRAINED = folder("pretrained") / "artflownet.safetensors"
 """The weights that this project publishes."""
@@ -117,31 +121,37 @@ class ArtFlowNet(CloudNetwork):
         return found.flows.gather(1, places).squeeze(1)
 
     @torch.no_grad()
-    def predict(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None = None) -> Cloud:
+    def predict(self, points: Cloud, part_mask: object = None) -> Cloud:
         """The flow of a cloud of any size, in evaluation mode; of several hypotheses the most probable.
 
         A cloud of more than 1200 points is dealt out at random (always alike) into clouds of at most as many, and each
-        point's flow is the one that its own gets.
+        point's flow is the one that its own gets. Of more than 19,200 points (:data:`LARGEST`) as many are drawn
+        (always alike), and each other point's flow is that of the nearest of them on its side of the mask.
 
         Args:
-            points: [N, 3] m, z up; an array or a tensor on any device. Points that are not finite count as missing.
-            part_mask: [N] bool, the points on the part to open; needed if the network was trained with nothing else.
+            points: [N, 3] m, z up: an array of any kind of numbers, strides and byte order, a structured array with
+                x, y and z, nested lists, or a tensor on any device. Points that are not finite count as missing, and
+                so do those that are a thousand times as far away as the others (``near_origin``).
+            part_mask: [N], the points on the part to open; needed if the network was trained with nothing else.
+                bool, 0 and 1, one id with -1 for the rest, or scores from 0 to 1
+                (:func:`~fb3d_rl.perception.arrays.as_mask`).
 
         Returns:
-            [N, 3] f32 of the kind of ``points``, on its device; largest norm about 1, 0 where a point is missing.
+            [N, 3] f32: a tensor on the device of ``points`` if that is one, else an array; largest norm about 1, 0
+            where a point is missing.
 
         Raises:
-            UserError: a shape is another, or the mask is missing.
+            UserError: a shape is another, the mask is missing, or one of the two holds something else.
         """
         cloud, mask = self._checked(points, part_mask)
-        flows, log_probabilities = self._dealt(cloud, mask)
+        flows, log_probabilities = self._spread(cloud, mask)
         valid = cloud.isfinite().all(1)
         shown = None if part_mask is None else mask[None]
         flow = self.most_probable(Hypotheses(flows[None], log_probabilities[None]), valid[None], shown)
         return _as_given(flow[0], points)
 
     @torch.no_grad()
-    def predict_all(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None = None) -> tuple[Cloud, Cloud]:
+    def predict_all(self, points: Cloud, part_mask: object = None) -> tuple[Cloud, Cloud]:
         """All hypotheses for a cloud of any size, the most probable first.
 
         Args:
@@ -156,26 +166,38 @@ class ArtFlowNet(CloudNetwork):
             UserError: as :meth:`predict`.
         """
         cloud, mask = self._checked(points, part_mask)
-        flows, log_probabilities = self._dealt(cloud, mask)
+        flows, log_probabilities = self._spread(cloud, mask)
         about = mask if part_mask is not None else (flows.norm(dim=2) > 0.1).any(0)
         about = about & cloud.isfinite().all(1)
         probabilities = Hypotheses(flows[None], log_probabilities[None]).of_clouds(about[None])[0]
         order = probabilities.argsort(descending=True, stable=True)
         return _as_given(flows[order], points), _as_given(probabilities[order], points)
 
-    def _checked(self, points: Cloud, part_mask: Tensor | NDArray[np.bool_] | None) -> tuple[Tensor, Tensor]:
-        """The cloud [N, 3] f32 and the mask [N] on the network's device."""
-        cloud = torch.as_tensor(points)
-        if cloud.ndim != 2 or cloud.shape[1] != 3 or not cloud.is_floating_point():
-            raise UserError(f"The cloud is {cloud.dtype} {list(cloud.shape)}: give floats [N, 3].")
+    def _checked(self, points: object, part_mask: object) -> tuple[Tensor, Tensor]:
+        """The cloud [N, 3] f32, NaN where a point is missing, and the mask [N] on the network's device."""
+        cloud = as_points(points)
         if part_mask is None and needs_mask(self):
             raise UserError("This network was trained with the mask of the part to open: give part_mask, [N] bool.")
-        count = len(cloud)
-        mask = torch.ones(count, dtype=torch.bool) if part_mask is None else torch.as_tensor(part_mask)
-        if mask.shape != (count,):
-            raise UserError(f"The mask is {list(mask.shape)} for {count} points: give [N] bool.")
+        mask = torch.ones(len(cloud), dtype=torch.bool) if part_mask is None else as_mask(part_mask, len(cloud))
+        cloud, _ = near_origin(cloud)
         device = next(self.parameters()).device
-        return cloud.to(device, torch.float32), mask.to(device, torch.bool)
+        return cloud.to(device), mask.to(device)
+
+    def _spread(self, cloud: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`_dealt`, of a cloud of more than LARGEST points by way of as many of them."""
+        valid = cloud.isfinite().all(1)
+        rows = valid.nonzero().flatten()
+        if len(rows) <= LARGEST:
+            return self._dealt(cloud, mask)
+        drawn = draw(len(rows), LARGEST).to(cloud.device)
+        kept = rows[drawn]
+        found = self._dealt(cloud[kept], mask[kept])
+        near = nearest(cloud[rows], cloud[kept], mask[rows], mask[kept]).to(cloud.device)
+        near[drawn] = torch.arange(LARGEST, device=cloud.device)
+        flows = cloud.new_zeros(self.hypotheses, len(cloud), 3)
+        log_probabilities = cloud.new_full((self.hypotheses, len(cloud)), -math.log(self.hypotheses))
+        flows[:, rows], log_probabilities[:, rows] = (x[:, near] for x in found)
+        return flows, log_probabilities
 
     def _dealt(self, cloud: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
         """Flows [K, N, 3] and log-probabilities [K, N] of a cloud of any size, dealt out into clouds of POINTS."""

@@ -98,6 +98,17 @@ class Figure:
 
 
 @dataclass(frozen=True)
+class Picker:
+    """A line that says which box the points span that were clicked in the figures, as an option to copy.
+
+    Attributes:
+        prefix: what stands before its two corners.
+    """
+
+    prefix: str
+
+
+@dataclass(frozen=True)
 class Viewer:
     """Two linked 3D scenes, true next to predicted flow, on a narrow page one above the other.
 
@@ -248,7 +259,20 @@ class Gallery:
 
 
 Block: TypeAlias = (
-    Heading | Note | Source | Facts | Cards | Legend | Figure | Viewer | Table | Titled | Grid | Choice | Gallery
+    Heading
+    | Note
+    | Source
+    | Facts
+    | Cards
+    | Legend
+    | Figure
+    | Picker
+    | Viewer
+    | Table
+    | Titled
+    | Grid
+    | Choice
+    | Gallery
 )
 """What a section is made of: the template blocks.html has a macro for each."""
 

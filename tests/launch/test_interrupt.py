@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,8 +46,9 @@ COMMANDS = {
     "report": ["report.py", "."],
     "benchmark": ["benchmark.py", "network", "--rounds", "1"],
     "export": ["export.py", "pretrained", "net.pt2"],
+    "predict": ["predict.py", "cloud.npy", "out=made"],
 }
-SOME = {("validate", 0.05), ("train", 0.4), ("evaluate", 1.5), ("report", 0.1), ("record", 0.8)}
+SOME = {("validate", 0.05), ("train", 0.4), ("evaluate", 1.5), ("report", 0.1), ("record", 0.8), ("predict", 1.5)}
 # Python's own start, before the first line of the script, is not the script's to guard.
 START = """
 import os, runpy, sys
@@ -71,6 +73,8 @@ def test_a_command_ends_in_one_line_whenever_it_is_interrupted(
 ) -> None:
     if name == "report":
         (tmp_path / "metrics.jsonl").write_text('{"step": 1, "train/loss": 0.5}\n')
+    if name == "predict":
+        np.save(tmp_path / "cloud.npy", np.random.default_rng(0).random((3000, 3)))
     if name == "unpack":
         shutil.make_archive(str(tmp_path / "objects"), "zip", procedural_root)
     words = [word.replace("ROOT", str(procedural_root)) for word in COMMANDS[name]]

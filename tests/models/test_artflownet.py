@@ -174,6 +174,31 @@ def test_a_large_cloud_gets_what_its_parts_would(make_net: Maker) -> None:
     assert torch.cosine_similarity(alone, among).median() > 0.95
 
 
+def test_a_huge_cloud_gets_the_flow_of_the_nearest_points_of_a_smaller_one(
+    make_net: Maker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fb3d_rl.models.artflownet.LARGEST", 1500)
+    net = make_net()
+    points = torch.rand(6000, 3, generator=torch.Generator().manual_seed(1))
+    mask = points[:, 2] > 0.5
+    drawn = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:1500]
+    own, flow = net.predict(points[drawn], mask[drawn]), net.predict(points, mask)
+    assert torch.equal(flow[drawn], own)
+    same_side = mask[:, None] == mask[drawn]
+    distance = torch.cdist(points, points[drawn]).masked_fill(~same_side, torch.inf)
+    source = (flow[:, None] == own).all(2).float().argmax(1)  # which of the drawn points a flow is that of
+    taken = distance.gather(1, source[:, None]).squeeze(1)
+    assert taken.isfinite().all(), "no flow crosses the border of the part"
+    assert (taken <= distance.amin(1) + 0.02).all(), "it is the nearest one, but for the size of a cell"
+
+
+def test_a_cloud_in_map_coordinates_gets_what_it_gets_at_the_origin(make_net: Maker) -> None:
+    net, points = make_net(), torch.rand(80, 3, generator=torch.Generator().manual_seed(1)).double()
+    expected = net.predict(points, points[:, 2] > 0.5)
+    moved = points + torch.tensor([3.2e6, 5.4e6, 120.0])
+    torch.testing.assert_close(net.predict(moved, points[:, 2] > 0.5), expected, atol=1e-4, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("shape", "mask", "word"),
     [((5, 2), torch.ones(5), "cloud"), ((2, 5, 3), torch.ones(5), "cloud"), ((5, 3), torch.ones(4), "mask"),
