@@ -188,7 +188,8 @@ class OpenArticulatedEnv(StagedEnv):
         for row, e in enumerate(which):
             stage = self.stages[e]
             start = stage.trial.start
-            state[row, stage.order] = torch.tensor(start, dtype=torch.float32)
+            positions = stage.tree.positions(torch.tensor(start, dtype=torch.float64))
+            state[row, [*stage.order, *stage.led]] = positions.float()
             hand[row, :3] = torch.from_numpy(self.options.gripper.start(stage.model.bounds(start)))
             self._progress.begin(e, stage)
             self._force[e] = 0.0
