@@ -87,7 +87,7 @@ class MeshFiles:
         if (found or Path(filename)).suffix.lower() not in MESHES:
             self.fail(f"the mesh {filename} is no {', '.join(MESHES[:-1])} or {MESHES[-1]} file")
         if found is None:
-            hint = ", and package:// paths are looked for there only" if "://" in filename else ""
+            hint = "; a package of another folder is to be named: assets.packages=[DIR]" if "://" in filename else ""
             self.fail(f"the mesh {filename} is missing in {self.folder}{hint}")
         return found
 

@@ -79,6 +79,9 @@ def content_of(folder: Path) -> str:
 
 def _urdf_of(folder: Path) -> Path:
     urdf = find_urdf(folder)
+    others = sorted(folder.glob("*.urdf"))
+    if urdf is None and len(others) == 1:  # of another name
+        return others[0]
     if urdf is None:
         raise UserError(
             f"object {folder.name}: {folder / URDFS[-1]} does not exist, so the folder is no PartNet-Mobility object"

@@ -61,11 +61,13 @@ class UrdfReader:
         folder: the object's folder, named like the object; relative paths are of files in it.
         urdf: the file.
         packages: further folders that its meshes may be in.
+        unit: metres in one unit of the mesh files, beside their scale.
     """
 
-    def __init__(self, folder: Path, urdf: Path, packages: Sequence[Path] = ()) -> None:
+    def __init__(self, folder: Path, urdf: Path, packages: Sequence[Path] = (), unit: float = 1.0) -> None:
         self.folder = folder
         self.urdf = urdf
+        self.unit = unit
         self.dropped: list[str] = []
         self.lost: list[str] = []
         self.files = MeshFiles(folder, packages, self.fail, self.dropped.append)
@@ -327,7 +329,7 @@ class UrdfReader:
         scale = self.numbers(text, 1 if text is not None and len(text.split()) == 1 else 3, 1.0)
         if not scale.all():
             self.fail(f'the mesh {filename} has scale="{text}", which leaves no solid; give three factors other than 0')
-        return np.broadcast_to(scale, 3).copy()
+        return self.unit * np.broadcast_to(scale, 3)
 
     def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool) -> Mesh:
         """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.

@@ -18,6 +18,9 @@ CONTROLS = frozenset(
 )
 """Semantic names of parts that are turned, pressed or lie inside, but are not what one opens an object by."""
 
+LARGEST = 20.0
+"""An object with a larger diagonal (m) is not in metres."""
+
 MIN_TRAVEL = 0.015
 """A part whose farthest point moves less (m) over its joint's range opens nothing."""
 

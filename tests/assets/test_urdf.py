@@ -319,7 +319,7 @@ def refuse(folder: Path) -> str:
     ("urdf", "word"),
     [
         (robot(mesh("b.obj")), "b.obj is missing"),
-        (robot(mesh("package://nowhere/b.obj")), "missing in .* package:// paths"),
+        (robot(mesh("package://nowhere/b.obj")), r"missing in .* assets.packages"),
         (robot(mesh("a.step")), "no .obj, .stl"),
         (robot(mesh("http://example.org/a.obj")), "no file of this machine"),
         (robot(mesh("../secret.obj")), "leaves"),
