@@ -143,7 +143,13 @@ def _validate_assets(assets: AssetsOptions) -> None:
             raise UserError(f"assets.{key}={words} is no split; give a name or a list of names: [train_test,test]")
     if assets.source == "procedural":
         _at_least("assets.eval_count", assets.eval_count, 1)
-    elif not assets.root:
+    elif assets.source == "files":
+        if not assets.paths:
+            raise UserError(
+                "assets.root is not set; give a file, a folder of files or a list of paths: assets.root=PATH"
+            )
+        assets.metres  # noqa: B018 - refuses what is no scale
+    elif len(assets.paths) != 1:
         raise UserError("assets.root is not set; give the folder that holds PartNet-Mobility objects: assets.root=DIR")
 
 

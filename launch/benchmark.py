@@ -68,13 +68,13 @@ def run(options: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from fb3d_rl.assets.catalog import find_objects
     from fb3d_rl.benchmarks import environment as benchmark
     from fb3d_rl.benchmarks.network import draw_clouds, install_peer, network_speed
     from fb3d_rl.data.samples import SampleOptions
     from fb3d_rl.env.options import EnvOptions
     from fb3d_rl.evaluation.tables import number_rows
     from fb3d_rl.files import write_text
+    from fb3d_rl.importer.catalog import find_objects
     from fb3d_rl.kinematics.opening import openable_links
     from fb3d_rl.rollout.trials import schedule
     from fb3d_rl.training.checkpoint import git_revision

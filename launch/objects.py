@@ -1,11 +1,14 @@
-"""Make procedural objects; unpack, list, validate, preview and compare objects.
+"""Make procedural objects; import, unpack, list, validate, preview and compare objects.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
+python launch/objects.py import PATH... --out DIR [--category NAME] [--package DIR] [--scale .001] [--up y] [--front=+y]
 python launch/objects.py unpack ARCHIVE --out DIR
-python launch/objects.py list DIR [--split SPLIT]
-python launch/objects.py validate DIR [--out FILE.json] [--workers N]
-python launch/objects.py preview DIR --out FILE.png|html [--split SPLIT] [--each N]
+python launch/objects.py list PATH [--split SPLIT]
+python launch/objects.py validate PATH [--out FILE.json] [--workers N]
+python launch/objects.py preview PATH --out FILE.png|html [--split SPLIT] [--each N]
 python launch/objects.py compare DIR OTHER [--out FILE.json] [--workers N]
+
+PATH is a folder of PartNet-Mobility objects, a file such as a URDF, or a folder of such files.
 """
 
 from __future__ import annotations
@@ -50,25 +53,46 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--count", type=int, default=50, help="objects of each category (default: 50)")
     make.add_argument("--seed", type=int, default=0)
 
+    says = "import objects from files of other makers, such as URDFs, as PartNet-Mobility folders DIR/<id>"
+    take = commands.add_parser("import", help=says, description=says)
+    take.add_argument("paths", nargs="+", metavar="PATH", help="a file, or a folder of files")
+    take.add_argument("--out", type=Path, required=True, metavar="DIR")
+    take.add_argument(
+        "--category", help="of all of them (default: that of meta.json or of a folder's name, else unknown)"
+    )
+    take.add_argument(
+        "--package", action="append", default=[], metavar="DIR", help="a folder that package://NAME/ means"
+    )
+    take.add_argument(
+        "--scale", default="auto", help="metres in a unit of the files; auto recognises millimetres (default)"
+    )
+    take.add_argument("--up", default="z", choices=("z", "y"), help="which axis points up (default: z)")
+    take.add_argument(
+        "--front",
+        default="auto",
+        choices=("auto", "-x", "+x", "-y", "+y"),
+        help="--front=-x: where the front faces once z is up (default: auto, where the parts open to)",
+    )
+
     says = "unpack a .zip or .tar archive of objects; nothing in it can leave DIR"
     unzip = commands.add_parser("unpack", help=says, description=says)
     unzip.add_argument("archive", type=Path, metavar="ARCHIVE")
     unzip.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to make")
 
-    says = "list the objects at or below DIR: category, split, parts"
+    says = "list the objects at or below PATH: category, split, parts"
     table = commands.add_parser("list", help=says, description=says)
-    table.add_argument("dir", metavar="DIR")
+    table.add_argument("dir", metavar="PATH")
     table.add_argument("--split", default="all", help="a split, categories, ids or files, with commas (default: all)")
 
-    says = "list what is wrong with the objects below DIR; the exit code is 1 if one of them cannot be used"
+    says = "list what is wrong with the objects at or below PATH; the exit code is 1 if one of them cannot be used"
     check = commands.add_parser("validate", help=says, description=says)
-    check.add_argument("dir", type=Path, metavar="DIR")
-    check.add_argument("--out", type=Path, help="file to write (default: DIR/validation.json)")
+    check.add_argument("dir", type=Path, metavar="PATH")
+    check.add_argument("--out", type=Path, help="file to write (default: validation.json in the folder)")
     check.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes (default: one per core)")
 
-    says = "draw the objects below DIR, closed and open, with their joint axes"
+    says = "draw the objects at or below PATH, closed and open, with their joint axes"
     show = commands.add_parser("preview", help=says, description=says)
-    show.add_argument("dir", type=Path, metavar="DIR")
+    show.add_argument("dir", type=Path, metavar="PATH")
     show.add_argument("--out", type=Path, required=True, help="file to write: .png or .html")
     show.add_argument("--split", default="all", help="a split, categories or ids, with commas (default: all)")
     show.add_argument("--each", type=int, default=8, help="at most so many of each category (default: 8)")
@@ -113,6 +137,42 @@ def unpack(options: argparse.Namespace) -> None:
     print(f"{len(find_folders(options.out))} objects: {options.out}")
 
 
+def take(options: argparse.Namespace) -> int:
+    """Import files."""
+    from rich import box
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import track
+    from rich.table import Table
+
+    from fb3d_rl.assets.options import AssetsOptions
+    from fb3d_rl.errors import UserError
+    from fb3d_rl.importer.catalog import frame_of, imported
+    from fb3d_rl.importer.files import find_files
+    from fb3d_rl.kinematics.opening import openable_links
+
+    frame = frame_of(AssetsOptions(scale=options.scale, up=options.up, front=options.front))
+    sources = find_files(options.paths, options.package)
+    taken = [source.id for source in sources if (options.out / source.id).exists()]
+    if taken:
+        raise UserError(f"{options.out / taken[0]} exists already; choose another --out or remove it")
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ("object", "category", "parts that open", "what was changed or dropped"):
+        table.add_column(name, overflow="fold")
+    broken = 0
+    for source in track(sources, "objects", transient=True):
+        try:
+            obj, remarks = imported(source, frame, options.category, options.out)
+        except UserError as error:
+            broken += 1
+            table.add_row(source.id, "", "", f"[red]{escape(str(error))}[/red]")
+            continue
+        table.add_row(obj.id, obj.category, str(len(openable_links(obj))), escape("\n".join(remarks)))
+    Console().print(table)
+    print(f"{len(sources) - broken} objects: {options.out}; {broken} cannot be used (red)")
+    return 1 if broken else 0
+
+
 def listing(options: argparse.Namespace) -> None:
     """List objects."""
     from collections import Counter
@@ -121,13 +181,13 @@ def listing(options: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from fb3d_rl.assets.catalog import partnet_catalog
+    from fb3d_rl.importer.catalog import path_catalog
     from fb3d_rl.kinematics.opening import openable_links
 
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("object", "category", "split", "joints", "parts that open"):
         table.add_column(name, overflow="fold")
-    entries = partnet_catalog(options.dir, options.split)
+    entries = path_catalog(options.dir, options.split)
     for entry in sorted(entries, key=lambda entry: (entry.category, entry.id)):
         obj = entry.load()
         parts = Counter(obj.links[link].semantic or "no name" for link in openable_links(obj))
@@ -145,15 +205,15 @@ def preview(options: argparse.Namespace) -> None:
 
     from rich.progress import track
 
-    from fb3d_rl.assets.catalog import partnet_catalog
     from fb3d_rl.errors import UserError
+    from fb3d_rl.importer.catalog import path_catalog
     from fb3d_rl.report import preview
 
     if options.out.suffix not in (".png", ".html"):
         raise UserError(f"--out {options.out} is neither a .png nor a .html file; give one of them")
     if options.each < 1:
         raise UserError(f"--each {options.each} is too small; give 1 or more")
-    entries = sorted(partnet_catalog(str(options.dir), options.split), key=lambda entry: (entry.category, entry.id))
+    entries = sorted(path_catalog(options.dir, options.split), key=lambda entry: (entry.category, entry.id))
     seen: Counter[str] = Counter()
     objects = []
     for entry in entries:
@@ -177,15 +237,19 @@ def validate(options: argparse.Namespace) -> int:
     from fb3d_rl.children import withheld, worker_pool
     from fb3d_rl.errors import UserError
     from fb3d_rl.files import write_text
+    from fb3d_rl.importer.catalog import holds_folders
+    from fb3d_rl.importer.files import find_files
+    from fb3d_rl.importer.reading import examine_file
     from fb3d_rl.kinematics.validation import examine
 
     if options.workers < 1:
         raise UserError(f"--workers {options.workers} is too small; give 1 or more")
-    folders = list(find_folders(options.dir).values())
+    folders = list(find_folders(options.dir).values()) if holds_folders(options.dir) else []
+    sources = [] if folders else find_files(options.dir)
     with worker_pool(options.workers) as pool:
         with withheld():
-            examined = pool.map(examine, folders)
-        verdicts = list(track(examined, "objects", len(folders)))
+            examined = pool.map(examine, folders) if folders else pool.map(examine_file, sources)
+        verdicts = list(track(examined, "objects", len(folders or sources)))
     table = Table(box=box.SIMPLE_HEAD)
     for name in ("object", "category", "parts that open", "what is wrong"):
         table.add_column(name, overflow="fold")
@@ -194,7 +258,7 @@ def validate(options: argparse.Namespace) -> int:
         table.add_row(verdict.id, verdict.category, str(verdict.openable), "\n".join(texts))
     Console().print(table)
     broken = [verdict for verdict in verdicts if not verdict.usable]
-    out = options.out or options.dir / "validation.json"
+    out = options.out or (options.dir if options.dir.is_dir() else options.dir.parent) / "validation.json"
     write_text(out, json.dumps([verdict.entry() for verdict in verdicts], indent=1) + "\n")
     noted = sum(bool(verdict.findings) for verdict in verdicts) - len(broken)
     print(f"{len(verdicts)} objects: {len(broken)} cannot be used (red), {noted} more with a remark; wrote {out}")
@@ -248,6 +312,7 @@ def compare(options: argparse.Namespace) -> None:
 
 COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {
     "generate": generate,
+    "import": take,
     "unpack": unpack,
     "list": listing,
     "validate": validate,

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import torch
 
@@ -20,7 +20,6 @@ from fb3d_rl.assets.catalog import (
     entry_of,
     folder_entries,
     lost_geometry,
-    partnet_catalog,
     procedural_catalog,
 )
 from fb3d_rl.assets.splits import validation_ids
@@ -32,6 +31,7 @@ from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol
+from fb3d_rl.importer.catalog import given_catalog, holds_folders, path_catalog
 from fb3d_rl.options import taken
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.options import FlowPolicyOptions
@@ -61,8 +61,8 @@ def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
     train = [entry for entry in made if entry.split == "train_train"]
     held_out = [entry for entry in made if entry.split != "train_train"]
     if assets.source != "procedural":
-        train = partnet_catalog(assets.root, assets.split, assets.split_file) + train
-        held_out = partnet_catalog(assets.root, assets.eval_split, assets.split_file) + _beside_real(held_out)
+        train = given_catalog(assets, assets.split, out / "objects") + train
+        held_out = given_catalog(assets, assets.eval_split, out / "objects") + _beside_real(held_out)
     kept = validation_ids({entry.id: entry.category for entry in train}, assets.validation_share)
     if assets.validation_share and not kept:
         print("note: too few training objects to keep one for validation; there is no validation during training")
@@ -76,7 +76,7 @@ def eval_entries(assets: AssetsOptions, out: Path, seed: int) -> list[Entry]:
     made = _made(assets, out, seed, 0)
     if assets.source == "procedural":
         return made
-    return partnet_catalog(assets.root, assets.split, assets.split_file) + _beside_real(made)
+    return given_catalog(assets, assets.split, out / "objects") + _beside_real(made)
 
 
 def _made(assets: AssetsOptions, out: Path, seed: int, train_count: int) -> list[Entry]:
@@ -100,8 +100,8 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
         UserError: it names no object, or a folder of several.
     """
     word = None if cfg.object is None else str(cfg.object)
-    if word is not None and Path(word).expanduser().is_dir():
-        entries = folder_entries(word)
+    if word is not None and Path(word).expanduser().exists():
+        entries = folder_entries(word) if holds_folders(word) else path_catalog(word)
         if len(entries) > 1:
             raise UserError(
                 f"object={word} holds {len(entries)} objects; give one of its folders, or "
@@ -112,7 +112,9 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
         if word in procedural.FAMILIES:  # also if assets.categories leaves it out
             return procedural_catalog(out, [word], 0, 1, cfg.seed)[0].load()
         return entry_of(eval_entries(cfg.assets, out, cfg.seed), word).load()
-    return entry_of(folder_entries(cast(str, cfg.assets.root)), word).load()
+    if cfg.assets.source == "files":
+        return entry_of(given_catalog(cfg.assets, "all"), word).load()
+    return entry_of(folder_entries(cfg.assets.paths[0]), word).load()
 
 
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 JointType = Literal["revolute", "continuous", "prismatic", "fixed"]
 
@@ -25,6 +26,14 @@ class Mesh:
     faces: NDArray[np.int64]
 
 
+class Mimic(NamedTuple):
+    """How a joint follows another one: its position is ``multiplier`` times the other's plus ``offset`` (rad or m)."""
+
+    joint: str
+    multiplier: float
+    offset: float
+
+
 @dataclass(frozen=True, eq=False)
 class Joint:
     """The joint that carries a link.
@@ -35,6 +44,7 @@ class Joint:
         origin: T_parent_joint [4, 4] at joint position 0.
         axis: unit axis [3] in the joint's frame (zero for a fixed joint).
         limits: (lower, upper) rad or m; infinite for a continuous joint, (0, 0) for a fixed one.
+        mimic: the joint that this one follows, which itself follows none; None for a joint that moves by itself.
     """
 
     name: str
@@ -42,10 +52,20 @@ class Joint:
     origin: NDArray[np.float64]
     axis: NDArray[np.float64]
     limits: tuple[float, float]
+    mimic: Mimic | None = None
 
     @property
     def movable(self) -> bool:
         return self.type != "fixed"
+
+    def motion(self, position: float) -> NDArray[np.float64]:
+        """T_joint_link [4, 4]: where the joint's link stands in the joint's frame at a position (rad or m)."""
+        moved = np.eye(4)
+        if self.type == "prismatic":
+            moved[:3, 3] = position * self.axis
+        elif self.movable:
+            moved[:3, :3] = Rotation.from_rotvec(position * self.axis).as_matrix()
+        return moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +99,25 @@ class ArticulatedObject:
 
     @cached_property
     def movable(self) -> tuple[int, ...]:
-        """Indices of the links with a movable joint; position k of a joint state [J] belongs to ``movable[k]``."""
-        return tuple(i for i, link in enumerate(self.links) if link.joint is not None and link.joint.movable)
+        """Indices of the links with a joint that moves by itself; position k of a joint state [J] is ``movable[k]``'s.
+
+        Joints that follow another one have no position of their own in a joint state (:attr:`followers`).
+        """
+        return tuple(
+            i
+            for i, link in enumerate(self.links)
+            if link.joint is not None and link.joint.movable and not link.joint.mimic
+        )
+
+    @cached_property
+    def followers(self) -> dict[int, int]:
+        """Link whose joint follows another one -> the link of that one, which is among :attr:`movable`."""
+        owner = {self.joint_of(i).name: i for i in self.movable}
+        return {
+            i: owner[link.joint.mimic.joint]
+            for i, link in enumerate(self.links)
+            if link.joint is not None and link.joint.mimic is not None
+        }
 
     @cached_property
     def limits(self) -> NDArray[np.float64]:
@@ -102,9 +139,11 @@ class ArticulatedObject:
         raise KeyError(f"{self.id} has no link {name!r}")
 
     def descendants(self, link: int) -> tuple[int, ...]:
-        """The link itself and all links that it carries."""
+        """The link itself and all links that move with it: that it carries, or whose joints follow one of these."""
         carried = {link}
         for i, other in enumerate(self.links):
             if other.parent in carried:
                 carried.add(i)
+        while led := {i for i, leader in self.followers.items() if leader in carried} - carried:
+            carried |= {j for i in led for j in self.descendants(i)}
         return tuple(sorted(carried))

@@ -23,10 +23,10 @@ import numpy as np
 import platformdirs
 import trimesh
 
-from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh, Mimic
 from fb3d_rl.files import write_bytes
 
-VERSION = 3
+VERSION = 4
 """Version of the entries and of the reader whose results they hold; raise it when either changes."""
 
 WARNED = "FB3D_CACHE_WARNED"
@@ -101,7 +101,12 @@ def _pack(parsed: Parsed) -> memoryview:
     number = {key: k for k, key in enumerate(meshes)}
 
     def joint(link: Link) -> object:
-        return link.joint and {**asdict(link.joint), "origin": link.joint.origin.tolist(), "axis": [*link.joint.axis]}
+        if link.joint is None:
+            return None
+        entry = {**asdict(link.joint), "origin": link.joint.origin.tolist(), "axis": [*link.joint.axis]}
+        if link.joint.mimic is None:
+            del entry["mimic"]  # as it was before there were any: what is derived from these bytes stays the same
+        return entry
 
     table = {
         "links": [
@@ -148,7 +153,8 @@ def _unpack(payload: memoryview) -> Parsed:
             return None
         arrays = {key: np.array(entry[key], dtype=np.float64) for key in ("origin", "axis")}
         lower, upper = entry["limits"]
-        return Joint(**{**entry, **arrays, "limits": (lower, upper)})
+        mimic = Mimic(*entry["mimic"]) if "mimic" in entry else None
+        return Joint(**{**entry, **arrays, "limits": (lower, upper), "mimic": mimic})
 
     links = tuple(
         Link(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from rich.progress import Progress
 from fb3d_rl import procedural
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.folders import find_folders, find_split_file
-from fb3d_rl.assets.partnet_mobility import listed, load_object, load_objects, load_usable, read_category
+from fb3d_rl.assets.partnet_mobility import listed, load_objects, load_usable, read_category
 from fb3d_rl.assets.splits import CATEGORIES, TRAIN_CATEGORIES, UMPNET_SPLIT, read_split, select_ids, split_of
 from fb3d_rl.errors import UserError
 
@@ -34,7 +33,7 @@ class Entry:
 
     @property
     def id(self) -> str:
-        return self.folder.name
+        return self.folder.name if self.known is None else self.known.id
 
     def load(self) -> ArticulatedObject:
         """The object; it is read now unless it was before.
@@ -157,28 +156,6 @@ def partnet_catalog(
         log.warning("skipped: %s", item.reason)
     warn_of_lost_geometry(objects)
     return [Entry(obj.urdf.parent, obj.category, split_of(obj.id, obj.category, table), obj) for obj in objects]
-
-
-def find_objects(
-    objects: Iterable[ArticulatedObject] | str | Path | None, split: str | int | Sequence[object] = "all"
-) -> list[ArticulatedObject]:
-    """The objects that a user of the library names.
-
-    Args:
-        objects: the objects themselves, the folder of one object, or the folder of many; a cabinet, a microwave and a
-            pot, made anew, unless given.
-        split: which of a folder of many, see :func:`fb3d_rl.assets.splits.select_ids`.
-
-    Raises:
-        UserError: a folder holds no object, or none that can be used.
-    """
-    if objects is None:
-        with tempfile.TemporaryDirectory() as folder:
-            names = procedural.generate(Path(folder), ("StorageFurniture", "Microwave", "KitchenPot"), 1, seed=0)
-            return [load_object(Path(folder) / name) for name in names]
-    if isinstance(objects, (str, Path)):
-        return [entry.load() for entry in partnet_catalog(str(objects), split)]
-    return list(objects)
 
 
 def entry_of(entries: Sequence[Entry], word: str | None = None) -> Entry:

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.options import option
 
 
 @dataclass(frozen=True)
 class AssetsOptions:
-    """Which objects; ``split`` and ``eval_split`` are a word or a list of words."""
+    """Which objects; ``split`` and ``eval_split`` are a word or a list of words, ``root`` a path or a list of paths."""
 
-    source: Literal["procedural", "partnet_mobility"] = option(
-        "procedural", "made on the fly, or PartNet-Mobility folders read below root"
+    source: Literal["procedural", "partnet_mobility", "files"] = option(
+        "procedural", "made on the fly, PartNet-Mobility folders read below root, or files of other makers"
     )
-    root: str | None = option(
-        None, "folder that holds <id>/mobility.urdf or <Category>/<id>/mobility.urdf, or maniskill for its asset folder"
+    root: Any = option(
+        None,
+        "folder that holds <id>/mobility.urdf or <Category>/<id>/mobility.urdf, or maniskill for its asset folder; "
+        "files: a file, a folder of them, or a list of paths",
     )
     split: Any = option(
         "all",
@@ -47,3 +51,38 @@ class AssetsOptions:
         "is chosen then, such as best.safetensors, is chosen by these",
         within="[0, 1)",
     )
+    packages: list[str] = option([], "files: folders that package://NAME/... may mean, besides the object's own")
+    scale: Any = option(
+        "auto", "files: metres in one of their units; auto takes what is larger than 20 m as millimetres"
+    )
+    up: Literal["z", "y"] = option("z", "files: which axis points up")
+    front: Literal["auto", "-x", "+x", "-y", "+y"] = option(
+        "auto", "files: where the front faces once z is up; auto is where the parts open to"
+    )
+    category: str | None = option(
+        None, "files: the category of all of them", null="that of meta.json or of a folder's name, else unknown"
+    )
+
+    @property
+    def paths(self) -> list[str]:
+        """The paths that ``root`` names."""
+        return [str(path) for path in (self.root if isinstance(self.root, list) else [self.root]) if path]
+
+    @property
+    def metres(self) -> float | Literal["auto"]:
+        """``scale``, checked.
+
+        Raises:
+            UserError: it is neither auto nor a positive number.
+        """
+        try:
+            factor = math.nan if self.scale == "auto" else float(self.scale)
+        except (TypeError, ValueError):
+            factor = 0.0
+        if math.isnan(factor) and self.scale == "auto":
+            return "auto"
+        if not 0.0 < factor < math.inf:
+            raise UserError(
+                f"assets.scale={self.scale} is no scale; give auto or the metres in a unit of the files, such as 0.001"
+            )
+        return factor

@@ -18,8 +18,9 @@ from rich.progress import track
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.cache import cached, digest_of
 from fb3d_rl.assets.folders import URDFS, find_urdf
+from fb3d_rl.assets.mesh_files import MESHES
 from fb3d_rl.assets.splits import CATEGORIES
-from fb3d_rl.assets.urdf import MESHES, UrdfReader
+from fb3d_rl.assets.urdf import UrdfReader
 from fb3d_rl.errors import UserError
 
 LARGEST_TEXT = 16 * 2**20
@@ -78,6 +79,9 @@ def content_of(folder: Path) -> str:
 
 def _urdf_of(folder: Path) -> Path:
     urdf = find_urdf(folder)
+    others = sorted(folder.glob("*.urdf"))
+    if urdf is None and len(others) == 1:  # of another name
+        return others[0]
     if urdf is None:
         raise UserError(
             f"object {folder.name}: {folder / URDFS[-1]} does not exist, so the folder is no PartNet-Mobility object"
@@ -128,11 +132,13 @@ def _sources(folder: Path, urdf: Path) -> list[Path]:
     """The files that an object is read from; too large ones are refused."""
     texts = [path for path in (urdf, folder / "semantics.txt") if path.is_file()]
     _bound(folder, *texts)
-    inside = folder.resolve()
+    inside, text = folder.resolve(), urdf.read_bytes().lower()
+    # PartNet's formats always; others lie beside many objects (pictures of points, for one) and do not belong to them.
+    kinds = [suffix for suffix in MESHES if suffix in (".obj", ".stl") or suffix.encode() in text]
     meshes = sorted(
         path
         for path in folder.rglob("*")
-        if path.suffix.lower() in MESHES
+        if path.suffix.lower() in (*kinds, *[".bin"] * (".gltf" in kinds))
         and path.is_file()
         # The reader refuses a link out of the folder; its target is not to be opened before.
         and (not path.is_symlink() or path.resolve().is_relative_to(inside))

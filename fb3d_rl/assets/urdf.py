@@ -1,15 +1,17 @@
 """Read a URDF: links, joints, and the meshes of its visual and collision elements.
 
-The files come from anyone, so nothing in them is trusted: XML entities are refused, mesh paths may not leave the
-object's folder, sizes are bounded, and every flaw ends in one clear sentence (:class:`fb3d_rl.errors.UserError`).
+URDFs are read as people write them: what the format leaves open or what is often wrong gets a sensible value, and a
+remark says so (docs/objects.md lists the rules). The files come from anyone, so nothing in them is trusted: XML
+entities are refused, mesh paths may not leave the object's folder and its packages, sizes are bounded, and every flaw
+ends in one clear sentence (:class:`fb3d_rl.errors.UserError`).
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 from xml.etree.ElementTree import ParseError
@@ -20,27 +22,33 @@ from defusedxml import ElementTree
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.articulation import Joint, JointType, Link, Mesh
+from fb3d_rl.assets.articulation import Joint, JointType, Link, Mesh, Mimic
 from fb3d_rl.assets.cache import Parsed
+from fb3d_rl.assets.mesh_files import MeshFiles
+from fb3d_rl.assets.urdf_joints import FARTHEST, FASTENED, bounded, followed, led, sensible
 from fb3d_rl.errors import UserError
-from fb3d_rl.interrupt import Deferred
 
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
 JOINT_TYPES: tuple[JointType, ...] = ("revolute", "continuous", "prismatic", "fixed")
-MESHES = (".obj", ".stl")
+MIMIC = (("multiplier", 1.0), ("offset", 0.0))
+"""The attributes of a ``<mimic>`` with URDF's defaults."""
 
 MOST_LINKS = 1000
 
 DECOMPOSED = "mobility_cvx.urdf"
 """ManiSkill's URDF whose collision files hold several convex pieces each."""
 
-BROKEN = (ValueError, LookupError, AttributeError, TypeError, ArithmeticError, MemoryError, struct.error)
-"""What the parsers of meshes raise for files that are no meshes."""
+PRIMITIVES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "sphere": ("radius",),
+    "capsule": ("radius", "length"),
+}
+"""The shapes that need no file, with the attributes that give their size."""
 
-FARTHEST = 1e4
-"""Largest coordinate (m) that is accepted; a joint limit (m or rad) beyond it counts as infinite."""
+XACRO = "http://www.ros.org/wiki/xacro", "http://ros.org/wiki/xacro", "http://wiki.ros.org/xacro"
 
 CORNERS = 4
 """The least number of corners of a solid; a moving collision mesh with fewer collides as a thin plate."""
@@ -50,23 +58,59 @@ class UrdfReader:
     """Reads one URDF; keeps the meshes read so far, since visuals and collisions share them.
 
     Args:
-        folder: the object's folder, named like the object; its meshes must be inside of it.
+        folder: the object's folder, named like the object; relative paths are of files in it.
         urdf: the file.
+        packages: further folders that its meshes may be in.
+        unit: metres in one unit of the mesh files, beside their scale.
     """
 
-    def __init__(self, folder: Path, urdf: Path) -> None:
+    def __init__(self, folder: Path, urdf: Path, packages: Sequence[Path] = (), unit: float = 1.0) -> None:
         self.folder = folder
         self.urdf = urdf
-        self.files: dict[Path, tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        self.placed: dict[tuple[str, bytes, bytes, bool], Mesh] = {}
+        self.unit = unit
         self.dropped: list[str] = []
         self.lost: list[str] = []
+        self.files = MeshFiles(folder, packages, self.fail, self.dropped.append)
+        self.placed: dict[tuple[str, bytes, bytes, bool], Mesh] = {}
 
     def parse(self) -> Element:
+        """The ``<robot>``, its tags without namespaces.
+
+        Raises:
+            UserError: it is no URDF, or one whose macros were not expanded.
+            ParseError, DefusedXmlException: it is no well-formed XML or holds entities.
+        """
+        text = self.urdf.read_bytes()
         try:
-            return ElementTree.fromstring(self.urdf.read_bytes())
+            robot: Element = ElementTree.fromstring(text)
         except (LookupError, ValueError) as error:  # the XML declaration names an encoding that Python's parser lacks
             raise ParseError(str(error)) from error
+        except ParseError:
+            if b"<xacro:" in text:
+                self.fail_as_xacro("<xacro:...>")
+            raise
+        for element in robot.iter():
+            space, brace, tag = element.tag.rpartition("}")
+            if space[1:] in XACRO:
+                self.fail_as_xacro(f"<xacro:{tag}>")
+            element.tag = tag
+            for value in element.attrib.values():
+                if "${" in value or "$(" in value:
+                    self.fail_as_xacro(value)
+        if robot.tag != "robot":
+            self.fail(f"the file is no URDF, since it holds a <{robot.tag}> and no <robot>")
+        return robot
+
+    def fail_as_xacro(self, what: str) -> NoReturn:
+        raise UserError(
+            f"object {self.name}: {self.urdf} holds what xacro is to expand ({what}); run "
+            f"`xacro {self.urdf.name} > expanded.urdf` and read that file"
+        )
+
+    @property
+    def name(self) -> str:
+        """What messages call the object."""
+        return self.folder.name
 
     def read(self) -> Parsed:
         """The links, parents first, and the remarks on what was read.
@@ -92,25 +136,43 @@ class UrdfReader:
             if child in joints:
                 self.fail(f"link {child!r} is the child of two joints")
             joints[child] = (parent, joint)
+        joints = followed(joints, self.fail, self.dropped.append)
         semantics = self.semantics()
-        links: list[Link] = []
-        for name in self.parents_first(elements, joints):
+        links: dict[str, Link] = {}
+        for name in self.parents_first(self.joined(elements, joints), joints):
             carried = joints.get(name)
-            links.append(
-                Link(
-                    name=name,
-                    semantic=semantics.get(name, ""),
-                    parent=-1 if carried is None else [link.name for link in links].index(carried[0]),
-                    joint=None if carried is None else carried[1],
-                    visuals=self.shapes(elements[name], "visual"),
-                    collisions=self.shapes(elements[name], "collision"),
-                )
+            visuals, collisions = self.surfaces(elements[name])
+            links[name] = Link(
+                name=name,
+                semantic=semantics.get(name, ""),
+                parent=-1 if carried is None else list(links).index(carried[0]),
+                joint=None if carried is None else carried[1],
+                visuals=visuals,
+                collisions=collisions,
             )
+        found = led(map(self.limited, links.values(), [list(links.values())] * len(links)))
         lost = tuple(dict.fromkeys(self.lost))
-        return tuple(links), (*lost, *dict.fromkeys(self.dropped)), lost
+        return found, (*lost, *dict.fromkeys(self.dropped)), lost
+
+    def limited(self, link: Link, links: Sequence[Link]) -> Link:
+        """The link with usable limits of its joint."""
+        if link.joint is None or link.joint.mimic or link.joint.type not in ("revolute", "prismatic"):
+            return link
+        joint, say = sensible(link.joint, self.dropped.append), self.dropped.append
+        return replace(link, joint=bounded(joint, lambda: _length(links, links.index(link), joint.axis), say))
+
+    def joined(self, links: dict[str, Element], joints: dict[str, tuple[str, Joint]]) -> list[str]:
+        """The names of the links, without those that hold nothing and that no joint joins, such as a "world"."""
+        ends = {*joints, *(parent for parent, _ in joints.values())}
+        alone = [name for name, link in links.items() if name not in ends and link.find("visual") is None
+                 and link.find("collision") is None]  # fmt: skip
+        if not ends or not alone:
+            return list(links)
+        self.dropped.append(f"link {', '.join(alone)}: empty and joined to nothing, left out")
+        return [name for name in links if name not in alone]
 
     def fail(self, what: str) -> NoReturn:
-        raise UserError(f"object {self.folder.name}: {what}; correct or remove {self.urdf}")
+        raise UserError(f"object {self.name}: {what}; correct or remove {self.urdf}")
 
     def attribute(self, element: Element, name: str) -> str:
         value = element.get(name)
@@ -142,14 +204,18 @@ class UrdfReader:
         return transform
 
     def joint(self, element: Element) -> tuple[str, str, Joint]:
+        """Parent, child and joint, whose limits are those of the file: infinite where it has none."""
         name, kind = self.attribute(element, "name"), self.attribute(element, "type")
+        if kind in FASTENED:
+            self.dropped.append(f"joint {name}: {kind}, read as fixed")
+            kind = "fixed"
         if kind not in JOINT_TYPES:
-            self.fail(f"joint {name} has the type {kind!r}, not one of {', '.join(JOINT_TYPES)}")
+            self.fail(f"joint {name} has the type {kind!r}, not one of {', '.join((*JOINT_TYPES, *FASTENED))}")
         ends = [element.find(end) for end in ("parent", "child")]
         if ends[0] is None or ends[1] is None:
             self.fail(f"joint {name} lacks its parent or child")
         parent, child = (self.attribute(end, "link") for end in ends if end is not None)
-        axis, limits = np.zeros(3), (0.0, 0.0)
+        axis, limits, mimic = np.zeros(3), (0.0, 0.0), None
         if kind != "fixed":
             axis_element = element.find("axis")
             axis = self.numbers(None if axis_element is None else axis_element.get("xyz"), 3, 0.0)
@@ -160,27 +226,31 @@ class UrdfReader:
                 self.fail(f"joint {name} has an axis of length {length:.3g}")
             axis = axis / length
             limits = (-math.inf, math.inf) if kind == "continuous" else self.limits(element, name)
+            mimic = self.mimic(element)
         joint_type: JointType = kind
-        return parent, child, Joint(name, joint_type, self.origin(element), axis, limits)
+        return parent, child, Joint(name, joint_type, self.origin(element), axis, limits, mimic)
 
     def limits(self, element: Element, name: str) -> tuple[float, float]:
-        """Limits of a revolute or prismatic joint; missing or infinite ones stay infinite: nothing to open."""
+        """The limits of a revolute or prismatic joint; infinite if both are missing."""
         limit = element.find("limit")
-        if limit is None:
-            self.dropped.append(f"limits of joint {name}: missing")
+        ends = {} if limit is None else {end: limit.get(end) for end in ("lower", "upper")}
+        if not any(ends.values()):
             return (-math.inf, math.inf)
         try:
-            lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+            lower, upper = (float(end or 0.0) for end in ends.values())  # URDF's default
         except ValueError:
             lower, upper = math.nan, math.nan
         if math.isnan(lower) or math.isnan(upper):
             self.fail(f"joint {name} has limits that are no numbers")
-        if lower > upper:
-            self.dropped.append(f"limits of joint {name}: lower above upper, swapped")
-            lower, upper = upper, lower
-        if max(abs(lower), abs(upper)) > FARTHEST:
-            return (-math.inf, math.inf)
         return (lower, upper)
+
+    def mimic(self, element: Element) -> Mimic | None:
+        """The joint that a joint follows."""
+        mimic = element.find("mimic")
+        if mimic is None:
+            return None
+        multiplier, offset = (self.numbers(mimic.get(key), 1, value)[0] for key, value in MIMIC)
+        return Mimic(self.attribute(mimic, "joint"), float(multiplier), float(offset))
 
     def parents_first(self, links: Iterable[str], joints: dict[str, tuple[str, Joint]]) -> list[str]:
         """Order the links so that each comes after its parent; refuse loops and several roots."""
@@ -198,32 +268,68 @@ class UrdfReader:
             self.fail("the joint tree has a loop")
         return order
 
+    def surfaces(self, link: Element) -> tuple[tuple[Mesh, ...], tuple[Mesh, ...]]:
+        """The meshes of a link that are seen and those that are touched; where it lacks one kind, the other's."""
+        visuals, collisions = self.shapes(link, "visual"), self.shapes(link, "collision")
+        if visuals and not collisions:
+            self.dropped.append(f"link {link.get('name')}: no collision, so its visual is touched too")
+        elif collisions and not visuals:
+            self.dropped.append(f"link {link.get('name')}: no visual, so its collision is seen too")
+        return visuals or collisions, collisions or visuals
+
     def shapes(self, link: Element, tag: str) -> tuple[Mesh, ...]:
-        """The meshes of a link's ``<visual>`` or ``<collision>`` elements; all other shapes are lost."""
+        """The meshes of a link's ``<visual>`` or ``<collision>`` elements; shapes of unknown kinds are lost."""
         meshes: list[Mesh] = []
         others: Counter[str] = Counter()
         for element in link.findall(tag):
-            mesh = element.find("geometry/mesh")
-            shapes = [shape for shape in element.iterfind("geometry/*") if shape is not mesh]
-            others.update(f"<{shape.tag}>" for shape in shapes)
-            if mesh is None:
-                others["no shape"] += not shapes
-                continue
-            filename = self.attribute(mesh, "filename")
-            placed = self.place(
-                filename, self.numbers(mesh.get("scale"), 3, 1.0), self.origin(element), tag == "visual"
-            )
-            if tag == "collision" and self.urdf.name == DECOMPOSED:
-                meshes += self.pieces(placed, filename)
-            elif len(placed.faces):
-                meshes.append(placed)
-                if tag == "collision":
-                    self.remark_corners(placed, filename)
+            shapes = element.findall("geometry/*")
+            others["no shape"] += not shapes
+            for shape in shapes:
+                if shape.tag in PRIMITIVES:
+                    meshes.append(self.primitive(shape, self.origin(element)))
+                elif shape.tag == "mesh":
+                    meshes += self.meshes(shape, self.origin(element), tag)
+                else:
+                    others[f"<{shape.tag}>"] += 1
         self.lost += [
             f"{count} {tag}{'s' * (count > 1)} of {link.get('name')}: {shape} in place of a mesh"
             for shape, count in (+others).items()
         ]
         return tuple(meshes)
+
+    def primitive(self, shape: Element, transform: NDArray[np.float64]) -> Mesh:
+        """The mesh of a box, cylinder, sphere or capsule, all centred, the axis along z; moved by a transform."""
+        size = np.concatenate(
+            [self.numbers(self.attribute(shape, key), 3 if key == "size" else 1, 0.0) for key in PRIMITIVES[shape.tag]]
+        )
+        if not (size > 0).all() or size.max() > FARTHEST:
+            self.fail(f"a <{shape.tag}> has the size {' '.join(f'{value:g}' for value in size)}")
+        if shape.tag == "box":
+            solid = trimesh.creation.box(size)
+        elif shape.tag == "sphere":
+            solid = trimesh.creation.icosphere(radius=size[0])
+        else:
+            solid = getattr(trimesh.creation, shape.tag)(radius=size[0], height=size[1])
+        vertices = np.asarray(solid.vertices, dtype=np.float64) - np.mean(solid.bounds, axis=0)
+        return Mesh(vertices @ transform[:3, :3].T + transform[:3, 3], np.asarray(solid.faces, dtype=np.int64))
+
+    def meshes(self, mesh: Element, transform: NDArray[np.float64], tag: str) -> list[Mesh]:
+        """The meshes of a ``<mesh>``: none if it has no surface, several of a decomposed part."""
+        filename = self.attribute(mesh, "filename")
+        placed = self.place(filename, self.scale(mesh, filename), transform, tag == "visual")
+        if tag == "collision" and self.urdf.name == DECOMPOSED:
+            return self.pieces(placed, filename)
+        if len(placed.faces) and tag == "collision":
+            self.remark_corners(placed, filename)
+        return [placed] if len(placed.faces) else []
+
+    def scale(self, mesh: Element, filename: str) -> NDArray[np.float64]:
+        """The scale of a mesh along its three axes; one number is for all of them."""
+        text = mesh.get("scale")
+        scale = self.numbers(text, 1 if text is not None and len(text.split()) == 1 else 3, 1.0)
+        if not scale.all():
+            self.fail(f'the mesh {filename} has scale="{text}", which leaves no solid; give three factors other than 0')
+        return self.unit * np.broadcast_to(scale, 3)
 
     def place(self, filename: str, scale: NDArray[np.float64], transform: NDArray[np.float64], seen: bool) -> Mesh:
         """A file's mesh, scaled and moved by ``transform`` [4, 4]; the same for the same arguments.
@@ -233,7 +339,7 @@ class UrdfReader:
         """
         key = (filename, scale.tobytes(), transform.tobytes(), seen)
         if key not in self.placed:
-            vertices, faces = self.mesh(filename)
+            vertices, faces = self.files.surface(filename)
             with np.errstate(over="ignore", invalid="ignore"):
                 corners = (vertices * scale)[faces]
                 sides = corners[:, 1:] - corners[:, :1]
@@ -263,28 +369,6 @@ class UrdfReader:
                 f"{filename}: fewer than {CORNERS} distinct vertices; where it moves, it collides as a thin plate"
             )
 
-    def mesh(self, filename: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        path = (self.folder / filename).resolve()
-        if path in self.files:
-            return self.files[path]
-        if not path.is_relative_to(self.folder.resolve()):
-            self.fail(f"the mesh path {filename!r} leaves the object's folder")
-        if path.suffix.lower() not in MESHES:
-            self.fail(f"the mesh {filename} is no {' or '.join(MESHES)} file")
-        if not path.is_file():
-            self.fail(f"the mesh {filename} is missing")
-        try:
-            with Deferred():  # trimesh catches every exception while it looks for the file
-                loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
-            vertices = np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-            faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-        except BROKEN as error:
-            raise UserError(f"object {self.folder.name}: the mesh {filename} is broken ({error})") from error
-        if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices) or not np.isfinite(vertices).all()):
-            self.fail(f"the mesh {filename} has vertices that are missing or no numbers")
-        self.files[path] = (vertices, faces)
-        return self.files[path]
-
     def semantics(self) -> dict[str, str]:
         """Link name -> semantic name; a URDF alone names nothing."""
         return {}
@@ -301,3 +385,14 @@ def _each_once(
     first, number = trimesh.grouping.unique_rows(vertices, keep_order=True)
     faces = number[faces]
     return vertices[first], faces[np.sort(trimesh.grouping.unique_rows(np.sort(faces, axis=1))[0])]
+
+
+def _length(links: Sequence[Link], link: int, axis: NDArray[np.float64]) -> float:
+    """The length (m) along an axis [3] of a link with all that is fixed to it; 0 if none of them has a mesh."""
+    placed, along = {link: np.eye(4)}, []
+    for i, part in enumerate(links):
+        if part.parent in placed and part.joint is not None and not part.joint.movable:
+            placed[i] = placed[part.parent] @ part.joint.origin
+        if i in placed:
+            along += [(mesh.vertices @ placed[i][:3, :3].T + placed[i][:3, 3]) @ axis for mesh in part.visuals]
+    return float(np.ptp(np.concatenate(along))) if along else 0.0

@@ -40,6 +40,13 @@ PLATE = 0.002
 """Thickness (m) of the plate that replaces a flat mesh; PhysX itself makes flat panes as thick."""
 
 
+TENDON = 1e5
+"""Stiffness (N m/rad or N/m) of the tendon between joints that move together. Stiffer ones swallow what is pushed."""
+
+UNLIMITED = (-np.inf, np.inf)
+"""Limits of a joint that follows another one, whose limits hold for both."""
+
+
 def add_ground(scene: ManiSkillScene) -> None:
     """Add the plane z = 0, which does not collide with the object."""
     ground = scene.create_actor_builder()
@@ -95,8 +102,9 @@ class Model(Posed):
         builder.set_scene_idxs([e])
         builder.initial_pose = sapien.Pose(self.T_world_base)
         links: list[Any] = []
-        for link in obj.links:
-            links.append(builder.create_link_builder(links[link.parent] if link.joint is not None else None))
+        for i, link in enumerate(obj.links):
+            parent, offset = self._carrier(i)
+            links.append(builder.create_link_builder(links[parent] if link.joint is not None else None))
             links[-1].set_name(link.name)
             if link.joint is None:
                 links[-1].set_joint_properties("fixed", [], sapien.Pose(), sapien.Pose())
@@ -107,15 +115,51 @@ class Model(Posed):
             kinds = {"revolute": "revolute_unwrapped", "continuous": "revolute"}
             links[-1].set_joint_properties(
                 kinds.get(link.joint.type, link.joint.type),
-                [list(link.joint.limits)] if link.joint.movable else [],
-                sapien.Pose(link.joint.origin) * axis,
+                [list(UNLIMITED if link.joint.mimic else link.joint.limits)] if link.joint.movable else [],
+                sapien.Pose(offset @ link.joint.origin) * axis,
                 axis,
             )
         articulation: Articulation = builder.build(name=f"object-{e}", fix_root_link=True)
         for joint in articulation.active_joints:
             joint.set_friction(o.joint_friction)
             joint.set_drive_properties(0.0, o.joint_damping, mode="acceleration")
+        for follower, leader in obj.followers.items():
+            self._couple(articulation, follower, leader)
         return articulation
+
+    def _carrier(self, link: int) -> tuple[int, NDArray[np.float64]]:
+        """The link to whose body a link is joined, and T_carrier_parent [4, 4]: its parent, as it is in the file.
+
+        Where joints follow others it is the next link above that moves, or the root: PhysX couples joints only if no
+        fixed one is between them.
+        """
+        parent, offset = self.obj.links[link].parent, np.eye(4)
+        while self.obj.followers and parent > 0 and not (joint := self.obj.joint_of(parent)).movable:
+            parent, offset = self.obj.links[parent].parent, joint.origin @ offset
+        return parent, offset
+
+    def _couple(self, articulation: Articulation, follower: int, leader: int) -> None:
+        """Let a joint follow another one: by a tendon, a spring on ``follower - ratio * leader - offset``, both ways.
+
+        A tendon runs over all joints that move between the two, of which the others have the coefficient 0.
+        """
+        ways = [[follower], [leader]]
+        for way in ways:
+            while way[0] > 0:
+                way.insert(0, self._carrier(way[0])[0])
+        while len(ways[0]) > 1 and len(ways[1]) > 1 and ways[0][1] == ways[1][1]:
+            del ways[0][0], ways[1][0]
+        if len(ways[0]) == 1 or len(ways[1]) == 1:  # one carries the other: the tendon starts above it
+            above = self._carrier(ways[0][0])[0]
+            ways = [[above, *way] for way in ways]
+        chain = list(dict.fromkeys([*ways[0], *ways[1]]))
+        multiplier, offset = self.tree.ratios[follower], self.tree.offsets[follower]
+        factors = [{follower: 1.0, leader: -multiplier}.get(i, 0.0) for i in chain]
+        links = [articulation.links_map[self.obj.links[i].name]._objs[0] for i in chain]
+        articulation._objs[0].create_fixed_tendon(
+            links, factors, [1.0 / factor if factor else 0.0 for factor in factors],
+            rest_length=offset, stiffness=TENDON,
+        )  # fmt: skip
 
     def add_shapes(self, links: Sequence[PhysxArticulationLinkComponent]) -> PhysxRigidStaticComponent:
         """Give the moving links their shapes; return a body with those of the static links.

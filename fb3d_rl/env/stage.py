@@ -46,6 +46,7 @@ class Stage:
         scene: the environment's own scene.
         links: the object's links in the simulator, in the order of ``object.links``.
         order: column of each of the J joints in the simulator's joint state.
+        led: columns of the joints that follow these.
         static: the body with the static links' collision surfaces.
         gripper: the gripper's links by name.
         suction: the suction of its gripper.
@@ -54,6 +55,7 @@ class Stage:
     scene: sapien.Scene
     links: list[PhysxArticulationLinkComponent]
     order: list[int]
+    led: list[int]
     static: PhysxRigidStaticComponent
     gripper: dict[str, PhysxArticulationLinkComponent]
     suction: Suction
@@ -118,7 +120,10 @@ class Stage:
         self.scene = scene.sub_scenes[e]
         self.links = [articulation.links_map[link.name]._objs[0] for link in self.object.links]
         active = [joint.child_link.name for joint in articulation.active_joints]
-        self.order = [active.index(self.object.links[i].name) for i in self.object.movable]
+        self.order, self.led = (
+            [active.index(self.object.links[i].name) for i in which]
+            for which in (self.object.movable, self.object.followers)
+        )
         self.gripper = {name: link._objs[e] for name, link in gripper.items()}
         self.static = self.model.add_shapes(self.links)
         entity = sapien.Entity()
@@ -134,7 +139,7 @@ class Stage:
     def place(self, trial: Trial) -> Stage:
         """The stage of another trial with the object that is already built."""
         stage = Stage(trial, self.model)
-        for name in ("scene", "links", "order", "static", "gripper", "suction"):
+        for name in ("scene", "links", "order", "led", "static", "gripper", "suction"):
             setattr(stage, name, getattr(self, name))
         return stage
 

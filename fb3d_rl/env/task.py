@@ -13,7 +13,6 @@ from mani_skill.utils.registration import register
 from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.catalog import find_objects
 from fb3d_rl.contract import ACTION_DIM
 from fb3d_rl.env.backends import choose_renderer, choose_simulator, require_mode
 from fb3d_rl.env.gripper import FloatingSuctionGripper, checked_action
@@ -24,6 +23,7 @@ from fb3d_rl.env.source import TrialSource
 from fb3d_rl.env.stage import Stage
 from fb3d_rl.env.staged import StagedEnv
 from fb3d_rl.errors import UserError
+from fb3d_rl.importer.catalog import find_objects
 
 TASK = "OpenArticulated-v1"
 """The task's name for ``gymnasium.make``."""
@@ -58,7 +58,8 @@ class OpenArticulatedEnv(StagedEnv):
       ``options.horizon`` control steps.
 
     Args:
-        objects: objects, or a PartNet-Mobility folder of one or of many; a few procedural objects unless given.
+        objects: objects, or the path of one or of many (PartNet-Mobility folders, URDF files); a few procedural
+            objects unless given.
         options: the task's constants.
         split: of a folder of many objects, those of this split, category or id (a name or a list).
         link: name of the link to open; any unless given.
@@ -188,7 +189,8 @@ class OpenArticulatedEnv(StagedEnv):
         for row, e in enumerate(which):
             stage = self.stages[e]
             start = stage.trial.start
-            state[row, stage.order] = torch.tensor(start, dtype=torch.float32)
+            positions = stage.tree.positions(torch.tensor(start, dtype=torch.float64))
+            state[row, [*stage.order, *stage.led]] = positions.float()
             hand[row, :3] = torch.from_numpy(self.options.gripper.start(stage.model.bounds(start)))
             self._progress.begin(e, stage)
             self._force[e] = 0.0

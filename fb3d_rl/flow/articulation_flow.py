@@ -21,7 +21,8 @@ def articulation_flow(tree: KinematicTree, points: Tensor, links: Tensor, poses:
     cut across a revolute joint's arc, so the difference is taken over half a step each way, along the tangent. It has a
     closed form: ``2 sin(STEP / 2) a x (p - o)`` for a joint that turns about the unit axis a through o (Rodrigues'
     formula, in which the terms with the cosine cancel), ``STEP a`` for one that slides. Where several joints move at
-    once (all movable parts), a point gets the sum of the displacements of all the joints that carry it.
+    once (all movable parts, or a joint and those that follow it), a point gets the sum of the displacements of all the
+    joints that carry it; a follower's is its ratio times as large.
 
     Args:
         tree: the object's kinematic tree with L links and J joints.
@@ -35,9 +36,10 @@ def articulation_flow(tree: KinematicTree, points: Tensor, links: Tensor, poses:
     """
     dtype = tree.axes.dtype
     frames = poses.index_select(-3, tree.movable).to(dtype)
-    turn, slide = (frames[..., :3, :3] @ tree.screws * direction.to(dtype)[..., None, None]).unbind(-1)
+    along = direction.to(dtype)[..., tree.drivers] * tree.ratio
+    turn, slide = (frames[..., :3, :3] @ tree.screws * along[..., None, None]).unbind(-1)
     turn = 2.0 * math.sin(0.5 * STEP) * turn
-    # Each joint's displacement turn x p + offset, [..., J, 6], and its sum over the joints that carry a link.
+    # Each joint's displacement turn x p + offset, [..., M, 6], and its sum over the joints that carry a link.
     offset = STEP * slide - torch.linalg.cross(turn, frames[..., :3, 3])
     per_link = tree.carried @ torch.cat([turn, offset], dim=-1)
     turn, offset = per_link.gather(-2, (links + 1)[..., None].expand(*links.shape, 6)).split(3, dim=-1)

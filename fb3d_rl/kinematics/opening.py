@@ -18,6 +18,9 @@ CONTROLS = frozenset(
 )
 """Semantic names of parts that are turned, pressed or lie inside, but are not what one opens an object by."""
 
+LARGEST = 20.0
+"""An object with a larger diagonal (m) is not in metres."""
+
 MIN_TRAVEL = 0.015
 """A part whose farthest point moves less (m) over its joint's range opens nothing."""
 
@@ -79,15 +82,23 @@ def _rigid(obj: ArticulatedObject, link: int) -> set[int]:
     """The link and all that is fixed to it."""
     fixed = {link}
     for i in obj.descendants(link):
-        if obj.links[i].parent in fixed and i not in obj.movable:
+        if obj.links[i].parent in fixed and not obj.joint_of(i).movable:
             fixed.add(i)
     return fixed
 
 
 def travel(obj: ArticulatedObject, joint: int) -> float:
-    """Upper bound (m) of how far a point of joint ``joint``'s part moves over the joint's range."""
+    """Upper bound (m) of how far a point of joint ``joint``'s part moves over the joint's range.
+
+    Of joints that follow it, the one that moves its part farthest counts.
+    """
     link = obj.movable[joint]
-    lower, upper = obj.limits[joint]
+    moving = [link, *(follower for follower, leader in obj.followers.items() if leader == link)]
+    return max(_travel(obj, each) for each in moving)
+
+
+def _travel(obj: ArticulatedObject, link: int) -> float:
+    lower, upper = obj.joint_of(link).limits
     if not np.isfinite([lower, upper]).all():
         return 0.0
     if obj.joint_of(link).type == "prismatic":

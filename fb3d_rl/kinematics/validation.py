@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.errors import UserError
-from fb3d_rl.kinematics.opening import openable_links, opening_range
+from fb3d_rl.kinematics.opening import LARGEST, openable_links, opening_range, standing_bounds
 from fb3d_rl.kinematics.tree import KinematicTree
 
 SAMPLES = 400
@@ -80,12 +80,21 @@ def examine(folder: Path) -> Verdict:
 
 def findings(obj: ArticulatedObject) -> list[Finding]:
     """The flaws of an object that could be read, the serious ones first."""
-    flaws = [*_joints(obj), *_surfaces(obj), *_blocked(obj)]
+    flaws = [*_size(obj), *_joints(obj), *_surfaces(obj), *_blocked(obj)]
     flaws += [
         Finding(f"{'left out' if what in obj.lost else 'noted'} while reading: {what}", serious=False)
         for what in obj.dropped
     ]
     return sorted(flaws, key=lambda finding: not finding.serious)
+
+
+def _size(obj: ArticulatedObject) -> Iterable[Finding]:
+    size = float(np.linalg.norm(np.diff(standing_bounds(obj), axis=0)))
+    if size > LARGEST:
+        yield Finding(f"measures {size:.4g} m across: millimetres? `assets=files` takes them as such", serious=False)
+    for joint in map(obj.joint_of, obj.movable):
+        if joint.type == "prismatic" and LARGEST < joint.limits[1] - joint.limits[0] < np.inf:
+            yield Finding(f"joint {joint.name} slides {joint.limits[1] - joint.limits[0]:.4g} m", serious=False)
 
 
 def _joints(obj: ArticulatedObject) -> Iterable[Finding]:

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.assets.catalog import partnet_catalog, procedural_catalog
+from fb3d_rl.assets.catalog import procedural_catalog
 from fb3d_rl.camera.raycast import CameraOptions
 from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import Key, spec
@@ -23,6 +23,7 @@ from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
 from fb3d_rl.errors import UserError
+from fb3d_rl.importer.catalog import path_catalog
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy
 from fb3d_rl.rollout.collectors import CollectorOptions, Episode, Workers
@@ -67,7 +68,7 @@ class Assets:
             UserError: there is none, or the split or a category is unknown.
         """
         if self.root is not None:
-            return [(entry.load(), entry.split) for entry in partnet_catalog(self.root, self.split)]
+            return [(entry.load(), entry.split) for entry in path_catalog(self.root, self.split)]
         with tempfile.TemporaryDirectory() as folder:
             made = procedural_catalog(Path(folder), self.categories, self.count, 0, self.seed)
             return [(entry.load(), entry.split) for entry in made]

@@ -66,7 +66,7 @@ def assert_same(a: ArticulatedObject, b: ArticulatedObject) -> None:
 
 def test_an_object_is_parsed_once(own: Path, folder: Path, parses: list[Path]) -> None:
     urdf = folder / "mobility.urdf"
-    box = "<visual><geometry><box/></geometry></visual>"
+    box = "<visual><geometry><torus/></geometry></visual>"
     urdf.write_text(urdf.read_text().replace("<visual", f"{box}<visual", 1))
     first = load_object(folder)
     moved = folder.rename(folder.with_name("elsewhere"))

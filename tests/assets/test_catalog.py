@@ -38,13 +38,13 @@ def test_objects_that_lost_geometry_are_named_and_many_are_counted(
     entries = procedural_catalog(tmp_path, ["Microwave"], 7, 0, seed=0)
     for entry in entries[:6]:
         urdf = entry.folder / "mobility.urdf"
-        urdf.write_text(urdf.read_text().replace("<visual", "<visual><geometry><box/></geometry></visual><visual", 1))
+        urdf.write_text(urdf.read_text().replace("<visual", "<visual><geometry><torus/></geometry></visual><visual", 1))
     (entries[6].folder / "semantics.txt").unlink()  # no geometry
     loaded = partnet_catalog(str(tmp_path), "all")
     lost = lost_geometry(entry.load() for entry in loaded)
     assert set(lost) == {entry.id for entry in entries[:6]}
     told = [record.getMessage() for record in caplog.records]
-    assert len(told) == 6 and all("<box> in place of a mesh" in line for line in told[:5])
+    assert len(told) == 6 and all("<torus> in place of a mesh" in line for line in told[:5])
     assert [line.split()[1].strip(":") for line in told[:5]] == list(lost)[:5] and "1 more" in told[5]
     caplog.clear()
     folder_entries(entries[0].folder)[0].load()  # as launch/view.py does

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from fb3d_rl.assets.catalog import find_objects, partnet_catalog
+from fb3d_rl.assets.catalog import partnet_catalog
 from fb3d_rl.assets.folders import find_folders, find_split_file
 from fb3d_rl.errors import UserError
+from fb3d_rl.importer.catalog import find_objects
 
 
 def test_objects_are_found_up_to_three_folders_deep(tmp_path: Path, procedural_root: Path) -> None:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
-from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.articulation import ArticulatedObject, Joint, JointType, Mimic
 from fb3d_rl.assets.folders import find_folders
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.env.options import EnvOptions, default_trial
@@ -18,6 +20,8 @@ from fb3d_rl.env.task import OpenArticulatedEnv
 from fb3d_rl.flow.articulation_flow import STEP, articulation_flow
 from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.kinematics.tree import KinematicTree
+
+from .chains import box, joint, make, pose
 
 
 def nested(obj: ArticulatedObject) -> bool:
@@ -27,8 +31,9 @@ def nested(obj: ArticulatedObject) -> bool:
 
 def simulated_poses(env: OpenArticulatedEnv, qpos: torch.Tensor) -> np.ndarray:
     """World poses [L, 4, 4] that the simulator gives the links at the joint state ``qpos`` [J]."""
-    state = torch.zeros(1, len(qpos))
-    state[:, env.stages[0].order] = qpos.float()
+    stage = env.stages[0]
+    state = torch.zeros(1, len(stage.order) + len(stage.led))
+    state[:, [*stage.order, *stage.led]] = stage.tree.positions(qpos).float()
     env.articulation.set_qpos(state)
     return np.stack([link.entity_pose.to_transformation_matrix() for link in env.stages[0].links]).astype(np.float64)
 
@@ -69,6 +74,57 @@ def check_flow(
 
 def test_procedural_objects(procedural_objects: dict[str, ArticulatedObject]) -> None:
     check(procedural_objects.values())
+
+
+def coupled() -> ArticulatedObject:
+    """Joints that follow others: beside them, above them, and across fixed and moving links."""
+    side = pose((0.0, 0.5, 0.2), Rotation.from_rotvec((0.3, 0.0, 0.2)))
+    door = replace(joint("revolute", (0, 0, 1), (0.0, 1.2), pose((0.1, -0.4, 0.0))), name="door")
+    plate = box((0.3, 0.02, 0.3), (0.2, 0.0, 0.0))
+
+    def follower(name: str, kind: JointType, multiplier: float, offset: float) -> Joint:
+        ends = sorted((offset, 1.2 * multiplier + offset))
+        limits = (ends[0], ends[1])
+        return replace(joint(kind, (0, 0.6, 0.8), limits, side), name=name, mimic=Mimic("door", multiplier, offset))
+
+    return make(
+        (-1, None, "", ()),
+        (0, replace(joint("fixed", origin=side), name="glue"), "", (box((0.5, 0.5, 0.5)),)),
+        (1, door, "door", (plate,)),
+        (1, follower("twin", "revolute", -1.5, 0.1), "", (plate,)),
+        (2, replace(joint("fixed", origin=side), name="hinge"), "", ()),
+        (4, follower("fold", "revolute", -2.0, 0.0), "", (plate,)),
+        (0, replace(joint("prismatic", (1, 0, 0), (0.0, 0.5), side), name="tray"), "drawer", (plate,)),
+        (6, follower("rack", "prismatic", 0.25, 0.0), "", (plate,)),
+    )
+
+
+def test_joints_that_follow_others() -> None:
+    check([coupled()])
+
+
+@pytest.mark.parametrize("pushed", ["door", "twin", "fold", "rack"])
+def test_whatever_of_a_coupled_mechanism_is_pushed_all_of_it_moves(pushed: str) -> None:
+    obj = coupled()
+    env = OpenArticulatedEnv([obj], EnvOptions(points=64))
+    env.reset(options={"trials": [default_trial(obj, obj.index("link_2"))]})
+    (articulation,), stage = env.articulation._objs, env.stages[0]
+    joints = [found.child_link.name for found in articulation.active_joints]
+    number = next(i for i, link in enumerate(obj.links) if link.joint is not None and link.joint.name == pushed)
+    force = np.zeros(len(joints))
+    mimic = obj.joint_of(number).mimic
+    force[next(k for k, name in enumerate(joints) if name.endswith(f"link_{number}"))] = (
+        10.0 if mimic is None else 10.0 * np.sign(mimic.multiplier)
+    )
+    for _ in range(150):
+        articulation.set_qf(force)
+        env.scene.step()
+        at = articulation.get_qpos()[[*stage.order, *stage.led]]
+        together = stage.tree.positions(torch.as_tensor(at[: len(stage.order)]))
+        np.testing.assert_allclose(at, together, atol=0.05)  # the moment it runs into its limit
+    np.testing.assert_allclose(at, together, atol=2e-3)
+    assert env.joint_positions()[0, 0] > 0.9
+    env.close()
 
 
 def test_real_objects_of_every_joint_type(real_root: Path) -> None:

@@ -28,6 +28,23 @@ def test_objects_are_made_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.slow
+def test_kinds_of_objects_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, seed in (("ours", "0"), ("theirs", "1")):
+        made = ["generate", "--out", str(tmp_path / name), "--categories", "Laptop,Phone", "--seed", seed]
+        assert main([*made, "--count", "4" if name == "ours" else "5"]) == 0
+    kinds, out = [str(tmp_path / "ours"), str(tmp_path / "theirs")], tmp_path / "compared.json"
+    assert main(["compare", *kinds, "--workers", "1", "--out", str(out)]) == 0
+    assert "4 / 5" in capsys.readouterr().out
+    found = json.loads(out.read_text())["categories"]
+    assert sorted(item["category"] for item in found) == ["Laptop", "Phone"]
+    assert all(item["counts"] == [4, 5] and 0 <= item["told"] <= 1 for item in found)
+    shutil.rmtree(tmp_path / "theirs" / "proc-Laptop-1-0000")
+    shutil.rmtree(tmp_path / "theirs" / "proc-Laptop-1-0001")
+    assert main(["compare", *kinds, "--workers", "1"]) == 0
+    assert "Laptop" not in capsys.readouterr().out.split("Told apart")[0], "too few"
+
+
+@pytest.mark.slow
 def test_objects_are_validated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["generate", "--out", str(tmp_path), "--categories", "Phone,Switch", "--count", "1"]) == 0
     assert main(["validate", str(tmp_path), "--workers", "1"]) == 0

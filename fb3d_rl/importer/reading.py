@@ -1,0 +1,154 @@
+"""Read an object from its file, and bring it to metres and PartNet-Mobility's axes.
+
+A reader is chosen by the root element of the file: :data:`READERS`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from xml.etree.ElementTree import ParseError
+
+import numpy as np
+from defusedxml import DefusedXmlException
+
+from fb3d_rl.assets.articulation import ArticulatedObject, Link
+from fb3d_rl.assets.cache import Parsed
+from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT, load_object
+from fb3d_rl.assets.urdf import UrdfReader
+from fb3d_rl.errors import UserError
+from fb3d_rl.importer.files import HEAD, Source
+from fb3d_rl.importer.frames import MILLI, Frame, in_metres, upright
+from fb3d_rl.kinematics.opening import CONTROLS, LARGEST, openable_links
+from fb3d_rl.kinematics.validation import Finding, Verdict, findings
+
+NAMES = CONTROLS | frozenset("door drawer lid cover seat screen window sash flap leaf cap".split())
+"""What a link can be called: the last of these words in its name is its semantic name."""
+
+MIXED = 100.0
+"""Meshes so many times as large as the distances between joints are in other units than these."""
+
+
+class FileReader(UrdfReader):
+    """Reads a URDF that stands alone: its links' names tell what they are.
+
+    Args:
+        source: the file.
+        unit: metres in one unit of the mesh files.
+    """
+
+    def __init__(self, source: Source, unit: float = 1.0) -> None:
+        super().__init__(source.path.parent, source.path, source.packages, unit)
+        self.id = source.id
+
+    @property
+    def name(self) -> str:
+        """The object's id: its folder may hold several."""
+        return self.id
+
+    def semantics(self) -> dict[str, str]:
+        """Link name -> the last word in it that is a known name of a part."""
+        words = {
+            element.get("name", ""): [
+                word for word in re.split(r"[\W_\d]+", element.get("name", "").lower()) if word in NAMES
+            ]
+            for element in self.parse().findall("link")
+        }
+        return {name: found[-1] for name, found in words.items() if found}
+
+
+def read_urdf(source: Source) -> Parsed:
+    """The links of a URDF, with its meshes in the unit of its joints.
+
+    Raises:
+        UserError: something is missing or broken.
+    """
+    links, dropped, lost = FileReader(source).read()
+    size, distance = _extents(links)
+    if size <= LARGEST or not 0.0 < MIXED * distance < size:
+        return links, dropped, lost
+    links, dropped, lost = FileReader(source, MILLI).read()
+    return links, (*dropped, "lengths: the meshes are taken as millimetres, the joints as metres"), lost
+
+
+READERS: dict[bytes, Callable[[Source], Parsed]] = {b"robot": read_urdf}
+"""The reader of each kind of file, by the root element."""
+
+
+def read_file(source: Source, frame: Frame | None = None, category: str | None = None) -> ArticulatedObject:
+    """Read an object.
+
+    A PartNet-Mobility object keeps its axes unless others are asked for.
+
+    Args:
+        source: the file.
+        frame: the file's units and axes; recognised unless given.
+        category: the object's category; that of its file (meta.json beside it, a folder's name) unless given.
+
+    Raises:
+        UserError: the object cannot be used; says why.
+    """
+    frame = frame or Frame()
+    if source.partnet:
+        obj = replace(load_object(source.path.parent), id=source.id)
+    else:
+        links, dropped, lost = _parsed(source)
+        obj = ArticulatedObject(source.id, _category(source), source.path, links, dropped, lost)
+    obj = replace(obj, category=category or obj.category)
+    if not any(link.visuals for link in obj.links):
+        raise UserError(f"object {obj.id}: no link has a shape, so there is nothing to see; add them to {source.path}")
+    moved = in_metres(obj, frame.scale)
+    if not (source.partnet and frame.front == "auto" and frame.up == "z"):
+        moved = upright(moved, frame.up, frame.front)
+    return moved if moved is obj else replace(moved, content="")
+
+
+def _parsed(source: Source) -> Parsed:
+    path = source.path
+    try:
+        if path.stat().st_size > LARGEST_TEXT:
+            raise UserError(
+                f"object {source.id}: {path} is larger than the {LARGEST_TEXT / 2**20:.0f} MiB that are read"
+            )
+        with path.open("rb") as stream:
+            head = stream.read(HEAD)
+        kind = next((root for root in READERS if b"<" + root in head), b"robot")
+        return READERS[kind](source)
+    except (ParseError, DefusedXmlException) as error:
+        raise UserError(f"object {source.id}: {path} is no well-formed XML ({error}); restore the file") from error
+    except OSError as error:
+        raise UserError(f"object {source.id}: {error.filename} cannot be read ({error.strerror})") from error
+
+
+def _category(source: Source) -> str:
+    """The category in the meta.json beside the file, else that of the folders above."""
+    try:
+        meta = json.loads((source.path.parent / "meta.json").read_text(encoding="utf-8"))
+        return str(meta["model_cat"])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return source.category
+
+
+def _extents(links: Sequence[Link]) -> tuple[float, float]:
+    """The diagonal (m) of the largest link, and the largest distance (m) that a joint has or makes."""
+    size = max(
+        (float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) for link in links for mesh in link.visuals), default=0.0
+    )
+    joints = [link.joint for link in links if link.joint is not None]
+    distances = [float(np.linalg.norm(joint.origin[:3, 3])) for joint in joints]
+    distances += [
+        abs(end) for joint in joints if joint.type == "prismatic" for end in joint.limits if math.isfinite(end)
+    ]
+    return size, max(distances, default=0.0)
+
+
+def examine_file(source: Source, frame: Frame | None = None, category: str | None = None) -> Verdict:
+    """The verdict on an object's file; that it cannot be read is a flaw too."""
+    try:
+        obj = read_file(source, frame, category)
+    except UserError as error:
+        return Verdict(source.id, "", 0, (Finding(str(error), serious=True),))
+    return Verdict(obj.id, obj.category, len(openable_links(obj)), tuple(findings(obj)))
