@@ -82,8 +82,8 @@ def main():
 READS_A_MESH = """
 from pathlib import Path
 import trimesh
-from fb3d_rl.assets.urdf import UrdfReader
-def swallows(path, **_):
+from fb3d_rl.assets.mesh_files import MeshFiles
+def swallows(*_, **__):
     try:
         press()
         time.sleep(0.3)
@@ -93,7 +93,7 @@ def swallows(path, **_):
 trimesh.load_mesh = swallows
 def main():
     Path("mesh.obj").touch()
-    UrdfReader(Path("."), Path("mobility.urdf")).mesh("mesh.obj")
+    MeshFiles(Path("."), [], sys.exit, print).surface("mesh.obj")
 """
 EXIT_CODE = """
 from fb3d_rl.errors import exit_code

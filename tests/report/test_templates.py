@@ -32,6 +32,7 @@ from fb3d_rl.report.page import (
     Heading,
     Legend,
     Note,
+    Picker,
     Row,
     Section,
     Shown,
@@ -98,6 +99,7 @@ BLOCKS: list[tuple[Block, int]] = [
     (Figure("one", {"data": [], "layout": {"title": EVIL}}), 0),
     (Viewer([cloud(EVIL)]), 0),
     (Table([[Cell(EVIL), Cell(EVIL, color="#000")]], [[Row([Cell(EVIL, EVIL), Cell(EVIL, color="#000")])]]), 5),
+    (Picker(EVIL), 0),  # it stands in an attribute
     (Titled(EVIL, Heading(EVIL)), 2),
     (Grid([Heading(EVIL)]), 1),
     (Choice(EVIL, [(EVIL, Heading(EVIL)), (EVIL, Note(EVIL))]), 5),
@@ -113,7 +115,7 @@ def test_no_text_of_a_block_becomes_html(block: Block, count: int, tmp_path: Pat
     inside = [script for script in found.scripts if "alert(1)" in script]
     assert len(inside) == isinstance(block, Figure | Viewer)
     assert all(EVIL in json.dumps(json.loads(script), ensure_ascii=False).replace('\\"', '"') for script in inside)
-    own = {"Figure": 3, "Viewer": 4}.get(type(block).__name__, 0)  # its data, plotly.js, and what draws it
+    own = {"Figure": 3, "Viewer": 4, "Picker": 1}.get(type(block).__name__, 0)  # its data, plotly.js, and what draws it
     assert found.elements["script"] == tame.elements["script"] + own
     assert not any(name.startswith("on") for name in found.names)
 
@@ -181,5 +183,6 @@ def test_templates_trust_only_what_the_package_holds() -> None:
         assert "autoescape" not in content
         trusted |= set(re.findall(r"([^\s({]+(?:\([^)]*\))?)\s*\|\s*safe", content))
     assert trusted == {
-        'web("page.css")', 'web("tools.js")', 'web("figures.js")', 'web("viewer.js")', "plotly_js()", '"<br>"',
+        'web("page.css")', 'web("tools.js")', 'web("figures.js")', 'web("viewer.js")', 'web("picker.js")',
+        "plotly_js()", '"<br>"',
     }  # fmt: skip
