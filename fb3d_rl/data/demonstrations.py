@@ -282,8 +282,11 @@ def demonstrated(frames: TensorDictBase) -> TensorDictBase:
     """Frames [T] of foreign data with the keys that they lack; the expert counts as acting in every step.
 
     Raises:
-        UserError: the observation or the action is not what the data contract says.
+        UserError: the observation or the action is not what the data contract says, there is no step, a number is not
+            finite, or an action is out of range.
     """
+    if not len(frames):
+        raise UserError("the data do not fit the task: an episode has no step; leave it out")
     if ("observation", "goal_sense") not in frames.keys(include_nested=True):
         frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # without a goal the task is to open
     try:
@@ -291,6 +294,7 @@ def demonstrated(frames: TensorDictBase) -> TensorDictBase:
         contract.check(frames, "action")
     except ValueError as error:
         raise UserError(f"the data do not fit the task: {error}") from error
+    _require_numbers(frames)
     steps = len(frames)
     labels: dict[Key, Tensor] = {
         ("expert", "action"): frames["action"],
@@ -301,6 +305,21 @@ def demonstrated(frames: TensorDictBase) -> TensorDictBase:
         if key not in frames.keys(include_nested=True):
             frames[key] = value
     return frames
+
+
+def _require_numbers(frames: TensorDictBase) -> None:
+    """Check the values that a learner reads; what lies at places without a point does not matter.
+
+    Raises:
+        UserError: see :func:`demonstrated`.
+    """
+    if not bool((frames["action"].abs() <= 1.0 + 1e-6).all()):  # NaN is out of range, too
+        raise UserError("the data do not fit the task: actions have to lie from -1 to 1; scale them, or leave out NaN")
+    observation = frames["observation"]
+    for key, value in observation.items():
+        seen = value[observation["valid"]] if key == "points" else value
+        if value.is_floating_point() and not bool(seen.isfinite().all()):
+            raise UserError(f"the data do not fit the task: observation {key} holds NaN or infinity; leave it out")
 
 
 def foreign_episode(category: str, success: bool, steps: int, seed: int = 0) -> EpisodeInfo:

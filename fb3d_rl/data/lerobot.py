@@ -114,6 +114,10 @@ def read(folder: Path, out: Path | str) -> DemonstrationBuffer:
                     EpisodeInfo.from_dict(own["episodes"][k]) if own else foreign_episode("unknown", True, len(frames))
                 )
                 buffer.extend(frames, facts)
+            if len(buffer) != info["total_frames"] or not len(buffer):
+                raise ValueError(
+                    f"{len(buffer)} of its {info['total_frames']} frames are there; was it written to the end?"
+                )
     except (OSError, ValueError, KeyError, TypeError, IndexError, arrow.ArrowException) as error:
         raise UserError(f"{folder} cannot be read as a data set of LeRobot ({error})") from error
     return buffer

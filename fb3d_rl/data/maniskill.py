@@ -74,6 +74,8 @@ def read(path: Path, out: Path | str) -> DemonstrationBuffer:
             with new_buffer(out, max(rows, 1), about.get(OWN, {"env_info": about.get("env_info")})) as buffer:
                 for entry in about["episodes"]:
                     buffer.extend(*_read_episode(file[f"traj_{entry['episode_id']}"], entry))
+                if rows and not len(buffer):
+                    raise ValueError(f"{path.with_suffix('.json').name} names none of the episodes")
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(f"{path} cannot be read as trajectories of ManiSkill ({error})") from error
     return buffer
@@ -112,10 +114,11 @@ def _read_episode(group: Any, entry: Mapping[str, Any]) -> tuple[TensorDictBase,
     _read_group(frames, group["obs"], ())
     if OWN in group:
         _read_group(frames, group[OWN], ())
+    frames = demonstrated(frames)
     if OWN in entry:
-        return demonstrated(frames), EpisodeInfo.from_dict(entry[OWN])
+        return frames, EpisodeInfo.from_dict(entry[OWN])
     success = "success" in group and bool(group["success"][-1])
-    return demonstrated(frames), foreign_episode("unknown", success, steps)
+    return frames, foreign_episode("unknown", success, steps)
 
 
 def _read_group(frames: TensorDictBase, group: Any, names: tuple[str, ...]) -> None:
@@ -126,6 +129,8 @@ def _read_group(frames: TensorDictBase, group: Any, names: tuple[str, ...]) -> N
             _read_group(frames, item, (*names, name))
         else:
             value = torch.from_numpy(item[: len(frames)])
+            if len(value) < len(frames):
+                raise ValueError(f"{'/'.join((*names, name))} has {len(value)} rows for {len(frames)} actions")
             frames[(*names, name)] = value if value.ndim > 1 else value[:, None]
 
 

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def frames(steps: int, seed: int) -> TensorDict:
             shape = [POINTS if size == "N" else int(size) for size in entry.shape]
             value = torch.randn(steps, *shape, generator=rng)
             td[key] = value > 0 if entry.dtype is torch.bool else value
-    td["expert", "action"] = torch.randn(steps, 8, generator=rng)
+    td["action"] = td["action"].tanh()
+    td["expert", "action"] = torch.randn(steps, 8, generator=rng).tanh()
     td["expert", "acts"] = torch.rand(steps, 1, generator=rng) > 0.5
     td["elapsed_steps"] = torch.arange(steps, dtype=torch.int32)[:, None]
     td["action"][0, 0] = -0.0  # equal to 0, but of other bits
@@ -172,6 +174,77 @@ def test_whatever_is_wrong_with_a_file_is_one_sentence_and_leaves_nothing(
     with pytest.raises(UserError, match="cannot be read"):
         maniskill.read(tmp_path / "x.h5", out)
     assert not out.exists()
+
+
+BAD = {
+    "a row is missing": (lambda group: shorten(group, "obs/observation/qpos", 3), r"observation/qpos has 3 rows for 7"),
+    "no step": (lambda group: [shorten(group, name, 0) for name in leaves(group)], "no step"),
+    "labels of no number": (lambda group: put(group["actions"], np.nan), "from -1 to 1"),
+    "labels that are too large": (lambda group: put(group["actions"], 7.5), "from -1 to 1"),
+    "points of no number": (lambda group: put(group["obs/observation/points"], np.nan), "points holds NaN"),
+    "an infinite force": (lambda group: put(group["obs/observation/contact_force"], np.inf), "contact_force holds NaN"),
+}
+
+
+def leaves(group: Any) -> list[str]:
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if hasattr(item, "shape") else None)
+    return names
+
+
+def shorten(group: Any, name: str, rows: int) -> None:
+    values = group[name][:rows]
+    del group[name]
+    group[name] = values
+
+
+def put(values: Any, number: float) -> None:
+    values[2] = number
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_an_episode_that_cannot_be_learned_from_is_refused(
+    tmp_path: Path, buffer: DemonstrationBuffer, what: str
+) -> None:
+    import h5py
+
+    change, says = BAD[what]
+    maniskill.write(buffer, tmp_path / "x.h5")
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        file["traj_2/obs/observation/valid"][:] = True
+        change(file["traj_2"])
+    with pytest.raises(UserError, match=says):
+        maniskill.read(tmp_path / "x.h5", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_lies_where_no_point_is_does_not_matter(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    import h5py
+
+    maniskill.write(buffer, tmp_path / "x.h5")
+    with h5py.File(tmp_path / "x.h5", "a") as file:
+        observation = file["traj_0/obs/observation"]
+        points = observation["points"][:]
+        points[~observation["valid"][:]] = np.nan
+        observation["points"][:] = points
+    assert len(maniskill.read(tmp_path / "x.h5", tmp_path / "out")) == len(buffer)
+
+
+def test_a_file_whose_table_names_no_episode_is_refused(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    maniskill.write(buffer, tmp_path / "x.h5")
+    about = json.loads((tmp_path / "x.json").read_text())
+    (tmp_path / "x.json").write_text(json.dumps({**about, "episodes": []}))
+    with pytest.raises(UserError, match="names none of the episodes"):
+        maniskill.read(tmp_path / "x.h5", tmp_path / "out")
+
+
+def test_a_data_set_that_was_not_finished_is_refused(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
+    pytest.importorskip("pyarrow")
+    lerobot.write(buffer, tmp_path / "y", rate=20)
+    (tmp_path / "y" / "data" / "chunk-000" / "file-000.parquet").unlink()
+    with pytest.raises(UserError, match="0 of its 20 frames"):
+        lerobot.read(tmp_path / "y", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_whatever_is_wrong_with_a_data_set_is_one_sentence_and_leaves_nothing(
