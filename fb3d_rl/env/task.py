@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.envs.registration import WrapperSpec
+from gymnasium.wrappers import TimeLimit
 from mani_skill.utils.registration import register
 from torch import Tensor
 
@@ -308,6 +311,22 @@ class OpenArticulatedEnv(StagedEnv):
         self.set_state_dict(take(self.get_state_dict()), env_idx)
 
 
+def take_time_limit(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """The task with the horizon that ``gymnasium.make(max_episode_steps=N)`` names, without the wrapper that it makes.
+
+    The wrapper has one count for all environments, and its ``truncated`` is no tensor, as ManiSkill's vector
+    environment asks for.
+    """
+    if not isinstance(env, TimeLimit):
+        return env
+    task, steps = env.unwrapped, int(env._max_episode_steps)
+    assert isinstance(task, OpenArticulatedEnv) and task.spec is not None
+    task.options = replace(task.options, horizon=steps)
+    task.spec.max_episode_steps, task.spec.additional_wrappers = steps, (_LIMIT,)  # so that the spec makes it again
+    return env.env
+
+
 # ManiSkill's own decorator would wrap the task in a time limit that overrides ``truncated``.
 register(TASK, OpenArticulatedEnv)
-gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True)
+_LIMIT = WrapperSpec("TimeLimit", f"{__name__}:take_time_limit", {})
+gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True, additional_wrappers=(_LIMIT,))

@@ -247,6 +247,20 @@ def test_gymnasium_makes_it(objects: dict[str, ArticulatedObject]) -> None:
     assert int(info["final_info"]["episode"]["episode_len"]) == 3
 
 
+def test_gymnasiums_time_limit_is_the_task_s_horizon(objects: dict[str, ArticulatedObject]) -> None:
+    """As ManiSkill's training scripts make it; gymnasium's own wrapper would answer True in place of a tensor."""
+    given = {"objects": [objects["Table"]], "options": EnvOptions(points=POINTS), "obs_mode": "state"}
+    made = gymnasium.make("fb3d_rl.env.task:OpenArticulated-v1", max_episode_steps=3, **given)
+    for env in (made, gymnasium.make(made.spec)):
+        assert env.unwrapped.options.horizon == env.unwrapped.max_episode_steps == 3
+        assert not isinstance(env, gymnasium.wrappers.TimeLimit)
+        vector = ManiSkillVectorEnv(env, auto_reset=True, ignore_terminations=True, record_metrics=True)
+        vector.reset(seed=0)
+        ends = [bool(vector.step(vector.action_space.sample())[3]) for _ in range(7)]
+        assert ends == [False, False, True] * 2 + [False]
+    assert EnvOptions(points=POINTS) == given["options"], "the user's own options are as they were"
+
+
 def test_it_needs_no_objects_from_outside() -> None:
     made = gymnasium.make("fb3d_rl.env.task:OpenArticulated-v1", obs_mode="none")
     assert len(made.unwrapped.objects) == 3
