@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -146,13 +146,20 @@ class OpenArticulatedEnv(StagedEnv):
                 environments are reset and one of them gets another object.
         """
         options = dict(options or {})
+        if isinstance(seed, list) and len(seed) == 1:
+            [seed] = seed
         if seed is not None:
             self._trial_rng = np.random.default_rng(seed)
         which = sorted(int(i) for i in options.get("env_idx", range(self.num_envs)))
         full = len(which) == self.num_envs
         trials = options.pop("trials", None)
+        seeds: list[int] | None = None if trials is None or not full else [trial.seed for trial in trials]
         if trials is None:
-            trials = [self._draw_trial(None if full else self.stages[i]) for i in which]
+            rng = self._trial_rng
+            if full:  # a seed of its own, which RecordEpisode keeps, so that the episode can be replayed
+                drawn = int(rng.integers(2**31)) if seed is None else seed
+                rng, seeds = np.random.default_rng(drawn), drawn if isinstance(drawn, list) else [drawn]
+            trials = [self._draw_trial(rng, None if full else self.stages[i]) for i in which]
         if len(trials) != len(which):
             raise UserError(f"{len(trials)} trials for {len(which)} environments; give one for each that is reset")
         drafts = [Stage(trial, self.source.model(trial.object)) for trial in trials]
@@ -172,14 +179,14 @@ class OpenArticulatedEnv(StagedEnv):
             for i, trial in zip(which, trials, strict=True):
                 self.stages[i] = self.stages[i].place(trial)
         options |= {"reconfigure": build, "env_idx": torch.tensor(which, device=self.device)}
-        return super().reset(seed=[stage.trial.seed for stage in self.stages] if full else None, options=options)
+        return super().reset(seed=seeds, options=options)
 
-    def _draw_trial(self, stage: Stage | None) -> Trial:
-        """A trial from the environment's own generator; for ``stage`` one that runs there without building anything."""
+    def _draw_trial(self, rng: np.random.Generator, stage: Stage | None) -> Trial:
+        """A trial; for ``stage`` one that runs there without building anything."""
         if stage is None:
-            return self.source.draw(self._trial_rng)
+            return self.source.draw(rng)
         view = stage.trial.view if self.scene.can_render() else None
-        return self.source.draw(self._trial_rng, stage.object.id, view)
+        return self.source.draw(rng, stage.object.id, view)
 
     def _initialize_episode(self, env_idx: Tensor, options: dict[str, Any]) -> None:
         which = env_idx.tolist()
@@ -284,9 +291,11 @@ class OpenArticulatedEnv(StagedEnv):
         """Restore a state of :meth:`get_state_dict`, taken in the same trials.
 
         Args:
-            state: rows for the environments that are restored.
+            state: rows for the environments that are restored, tensors or arrays; of a single one also without the
+                axis of the environments, as ManiSkill's trajectory files hold it.
             env_idx: which they are; all unless given.
         """
+        state = _rows_of(state, self.device)
         super().set_state_dict(state, env_idx)
         which = list(range(self.num_envs)) if env_idx is None else sorted(int(i) for i in env_idx)
         for row, e in enumerate(which):
@@ -309,6 +318,16 @@ class OpenArticulatedEnv(StagedEnv):
             return taken
 
         self.set_state_dict(take(self.get_state_dict()), env_idx)
+
+
+def _rows_of(state: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
+    """A state's tensors [E, D] on the device."""
+    return {
+        key: _rows_of(value, device)
+        if isinstance(value, Mapping)
+        else torch.atleast_2d(torch.as_tensor(value, dtype=torch.float32, device=device))
+        for key, value in state.items()
+    }
 
 
 def take_time_limit(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:

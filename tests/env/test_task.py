@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
+from typing import Any
 
 import gymnasium
+import h5py
 import numpy as np
 import pytest
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.trajectory import replay_trajectory
+from mani_skill.utils.wrappers import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 from tensordict import TensorDict
 
@@ -274,6 +279,59 @@ def test_flat_observations_are_the_state(objects: dict[str, ArticulatedObject]) 
     values = [value.float() for group in entries.values() for value in group.values()]
     torch.testing.assert_close(row, torch.cat(values, dim=-1))
     assert flat.single_observation_space.shape == row.shape[1:]
+
+
+def test_an_episodes_seed_makes_it_again(objects: dict[str, ArticulatedObject]) -> None:
+    """RecordEpisode keeps it, also of an episode that began without one."""
+    env = OpenArticulatedEnv(objects.values(), EnvOptions(points=POINTS, start="random"), obs_mode="state")
+    kept = []
+    for seed in (3, None, None, [4]):
+        env.reset(seed=seed)
+        kept.append((int(env._episode_seed[0]), env.stages[0].trial))
+    assert (kept[0][0], kept[3][0]) == (3, 4) and len({trial for _, trial in kept}) == 4
+    for number, trial in reversed(kept):
+        env.reset(seed=number)
+        assert env.stages[0].trial == trial
+
+
+def test_a_state_of_a_file_is_restored(objects: dict[str, ArticulatedObject]) -> None:
+    """There it is of arrays without the axis of the environments."""
+
+    def plain(state: Any) -> Any:
+        return {k: plain(v) for k, v in state.items()} if isinstance(state, dict) else state.cpu().numpy()[0]
+
+    env = OpenArticulatedEnv([objects["Table"]], EnvOptions(points=POINTS), obs_mode="state")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    state = env.get_state()
+    file = plain(env.get_state_dict())
+    env.reset(seed=0)
+    assert not torch.equal(env.get_state(), state)
+    env.set_state_dict(file)
+    assert torch.equal(env.get_state(), state)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", [[], ["--use-env-states"]], ids=["by actions", "by states"])
+def test_maniskill_replays_what_it_recorded(tmp_path: Path, extra: list[str]) -> None:
+    name, file = "fb3d_rl.env.task:OpenArticulated-v1", tmp_path / "trajectory.h5"
+    env = RecordEpisode(gymnasium.make(name, obs_mode="pointcloud"), str(tmp_path), save_video=False,
+                        trajectory_name="trajectory", source_type="test", source_desc="test")  # fmt: skip
+    for seed in (1, None):
+        env.reset(seed=seed)
+        for _ in range(5):
+            env.step(env.action_space.sample())
+    env.close()
+    words = ["--traj-path", str(file), "-o", "pointcloud", "--save-traj", "--allow-failure", *extra]
+    replay_trajectory.main(replay_trajectory.parse_args(words))
+    [replayed] = set(tmp_path.glob("*.h5")) - {file}
+    with h5py.File(file) as first, h5py.File(replayed) as second:
+        assert set(first) == set(second) == {"traj_0", "traj_1"}
+        for trajectory in first:
+            keys = [f"{trajectory}/obs/observation/{key}" for key in ("qpos", "points")]
+            for key in keys:
+                np.testing.assert_allclose(first[key][:], second[key][:], atol=1e-5)
 
 
 def test_trials_are_drawn_from_the_seed(objects: dict[str, ArticulatedObject]) -> None:

@@ -15,7 +15,7 @@ import torch
 import fb3d_rl
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import quaternion_to_matrix
-from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.artflownet import ArtFlowNet, Hypotheses
 from fb3d_rl.policies.contact import choose_contact
 from fb3d_rl.policies.options import ContactOptions
 
@@ -101,6 +101,20 @@ def test_without_a_mask_and_with_several_hypotheses(see: See) -> None:
         np.testing.assert_allclose(one.pull, flow, atol=1e-4)
 
 
+def test_a_hypothesis_in_which_nothing_moves_is_left_out(see: See) -> None:
+    seen = see()
+    several = ArtFlowNet(neighbors=16, hypotheses=3, generator=torch.Generator().manual_seed(0)).eval()
+    whole = several.propose
+
+    def still(*clouds: torch.Tensor) -> Hypotheses:
+        found = whole(*clouds)
+        found.flows[:, 1] = 0.0
+        return found
+
+    several.propose = still  # type: ignore[method-assign]
+    assert len(fb3d_rl.plan(seen.points[:1200], seen.part[:1200], seen.camera, model=several).hypotheses) == 2
+
+
 def test_a_tool_that_is_near_a_point_prefers_it(see: See, net: ArtFlowNet) -> None:
     seen = see("StorageFurniture")
     points, part = seen.points[:1200], seen.part[:1200]
@@ -135,7 +149,7 @@ HUGE = """
 import resource, sys, time
 import numpy as np
 import fb3d_rl
-from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.artflownet import ArtFlowNet, Hypotheses
 net = ArtFlowNet.from_pretrained()
 rng = np.random.default_rng(0)
 points = rng.random((10_000_000, 3), dtype=np.float32)
