@@ -50,7 +50,8 @@ def write_page(path: Path, plan: Plan, cloud: Path, remarks: Sequence[str]) -> N
     shown.append(Picker("mask=box:"))
     best = plan.hypotheses[0]
     facts = [(name.replace("_", " "), f"{_numbers(getattr(best, name))}  {UNITS[name]}") for name in VECTORS]
-    header: list[Block] = [Note(sentence(plan, remarks))]
+    said = sentence(plan, remarks)
+    header: list[Block] = [Note(f"{said[0].upper()}{said[1:]}.")]
     sections = [Section("Flow and contact", shown), Section("Plan, in the frame of the cloud", [Facts(facts)])]
     write(path, f"Plan for {cloud.name}", f"How to open {cloud.name}", header, sections)
 
