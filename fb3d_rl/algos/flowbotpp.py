@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, cast
 import torch
 from torch import Tensor, nn
 
-from fb3d_rl.algos.flow_network import FlowNetwork, flow_numbers
+from fb3d_rl.algos.flow_network import FlowNetwork
+from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.kinematics.joint_screw import projection_of_flow
 from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.models.flowbotpp import FlowProjectionNet
@@ -55,15 +56,18 @@ def flowbotpp_numbers(net: CloudNetwork, samples: TensorDictBase, device: torch.
     assert isinstance(net, FlowProjectionNet)
     training = net.training
     net.eval()
-    errors = []
+    flows, errors = [], []
     for batch in samples.split(32):
         points, valid, part = (batch["observation", key].to(device) for key in ("points", "valid", "part_mask"))
         part = part & valid
         true, turns = projection_of_flow(points, batch["privileged", "flow"].to(device), part)
-        error = (net.motions(points, valid, part)[1] - true).norm(dim=-1).masked_fill(~part, 0.0).sum(1) / part.sum(1)
+        flow, projection = net.motions(points, valid, part)
+        error = (projection - true).norm(dim=-1).masked_fill(~part, 0.0).sum(1) / part.sum(1)
+        flows.append(flow.cpu())
         errors.append(torch.where(turns, error, torch.nan).cpu())
     net.train(training)
-    return flow_numbers(net, samples, device) | {"projection_error": torch.cat(errors)}
+    numbers = flow_metrics(torch.cat(flows), samples["privileged", "flow"], samples["observation", "valid"])
+    return numbers | {"projection_error": torch.cat(errors)}
 
 
 ALGORITHM = FlowNetwork(FlowProjectionNet, flowbotpp_policy, flowbotpp_objective, flowbotpp_numbers)

@@ -120,7 +120,7 @@ class MeshFiles:
         if kind == ".dae":
             self._plain(path, filename)
         try:
-            # trimesh catches every exception while it looks for the file, an interruption too
+            # trimesh catches every exception in some places, an interruption too
             with Deferred(), path.open("rb") as stream:
                 loaded = trimesh.load_mesh(
                     stream, kind[1:], resolver=Within(path.parent, self.roots), process=False, skip_materials=True

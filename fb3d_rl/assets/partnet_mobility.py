@@ -7,7 +7,8 @@ sentence (:class:`fb3d_rl.errors.UserError`).
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import ParseError
@@ -57,15 +58,22 @@ def load_object(folder: str | Path) -> ArticulatedObject:
     """
     folder = Path(folder)
     urdf = _urdf_of(folder)
-    try:
+    with named_errors(folder.name, urdf):
         category = read_category(folder)
         content = digest_of(folder, _sources(folder, urdf))
         links, dropped, lost = cached(content, PartNetReader(folder, urdf).read)
         return ArticulatedObject(folder.name, category, urdf, links, dropped, lost, content)
+
+
+@contextmanager
+def named_errors(name: str, path: Path) -> Iterator[None]:
+    """What is wrong with the file ``path``, or a file that it names, as a UserError that names the object."""
+    try:
+        yield
     except (ParseError, DefusedXmlException) as error:
-        raise UserError(f"object {folder.name}: {urdf} is no well-formed XML ({error}); restore the file") from error
+        raise UserError(f"object {name}: {path} is no well-formed XML ({error}); restore the file") from error
     except OSError as error:
-        raise UserError(f"object {folder.name}: {error.filename} cannot be read ({error.strerror})") from error
+        raise UserError(f"object {name}: {error.filename} cannot be read ({error.strerror})") from error
 
 
 def content_of(folder: Path) -> str:

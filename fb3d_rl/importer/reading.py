@@ -10,14 +10,12 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from xml.etree.ElementTree import ParseError
 
 import numpy as np
-from defusedxml import DefusedXmlException
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Link
 from fb3d_rl.assets.cache import Parsed
-from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT, load_object
+from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT, load_object, named_errors
 from fb3d_rl.assets.urdf import UrdfReader
 from fb3d_rl.errors import UserError
 from fb3d_rl.importer.files import HEAD, Source
@@ -108,7 +106,7 @@ def read_file(source: Source, frame: Frame | None = None, category: str | None =
 
 def _parsed(source: Source) -> Parsed:
     path = source.path
-    try:
+    with named_errors(source.id, path):
         if path.stat().st_size > LARGEST_TEXT:
             raise UserError(
                 f"object {source.id}: {path} is larger than the {LARGEST_TEXT / 2**20:.0f} MiB that are read"
@@ -117,10 +115,6 @@ def _parsed(source: Source) -> Parsed:
             head = stream.read(HEAD)
         kind = next((root for root in READERS if b"<" + root in head), b"robot")
         return READERS[kind](source)
-    except (ParseError, DefusedXmlException) as error:
-        raise UserError(f"object {source.id}: {path} is no well-formed XML ({error}); restore the file") from error
-    except OSError as error:
-        raise UserError(f"object {source.id}: {error.filename} cannot be read ({error.strerror})") from error
 
 
 def _category(source: Source) -> str:

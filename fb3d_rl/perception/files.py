@@ -23,6 +23,9 @@ MASKS = ("part_mask", "mask", "scalar_part_mask", "scalar_mask")
 CLOUDS = ("points", "xyz", "vertices", "cloud", "pos", "arr_0")
 """Arrays of an NPZ file that are taken for the cloud."""
 
+IMAGES = (".png", ".tif", ".tiff")
+"""Images of depth, and of masks of these."""
+
 INTRINSICS = (
     "{stem}.json",
     "{stem}.yaml",
@@ -101,10 +104,10 @@ def read_cloud(
     file = Path(path)
     if not file.is_file():
         raise UserError(f"There is no file {file}: check the path.")
-    reader = READERS.get(file.suffix.lower())
-    if reader is None:
-        raise UserError(f"{file} is of no kind that is read: {', '.join(READERS)}.")
-    raw = _read(file, reader) if reader is not _depth else _depth_image(file, intrinsics, depth_scale)
+    kind = file.suffix.lower()
+    if kind not in (*READERS, *IMAGES):
+        raise UserError(f"{file} is of no kind that is read: {', '.join((*READERS, *IMAGES))}.")
+    raw = _read(file, READERS[kind]) if kind in READERS else _depth_image(file, intrinsics, depth_scale)
     points = as_points(raw.points)
     if not len(points):
         raise UserError(f"{file} holds no points.")
@@ -220,10 +223,6 @@ def _text(file: Path) -> _Raw:
     return _Raw(table[:, :3], {f"column{i}": table[:, i] for i in range(3, table.shape[1])})
 
 
-def _depth(file: Path) -> _Raw:
-    raise NotImplementedError  # it needs more than the file: _depth_image
-
-
 def _depth_image(file: Path, intrinsics: str | Path | None, depth_scale: float | None) -> _Raw:
     depth = read_depth(file)
     beside = (file.with_name(name.format(stem=file.stem)) for name in INTRINSICS)
@@ -245,9 +244,8 @@ def _depth_image(file: Path, intrinsics: str | Path | None, depth_scale: float |
 READERS: dict[str, Callable[[Path], _Raw]] = {
     ".ply": _ply, ".pcd": _pcd, ".npz": _npz, ".npy": _npy,
     ".xyz": _text, ".txt": _text, ".csv": _text, ".pts": _text, ".asc": _text,
-    ".png": _depth, ".tif": _depth, ".tiff": _depth,
 }  # fmt: skip
-"""What reads each kind of file."""
+"""What reads each kind of file that needs no other one."""
 
 
 def _mask(
@@ -306,7 +304,7 @@ def _checked(values: NDArray[Any], total: int, name: str) -> NDArray[np.bool_]:
 def _mask_file(file: Path) -> NDArray[Any]:
     """The numbers of a second file, one for each point."""
     try:
-        if file.suffix.lower() in (".png", ".tif", ".tiff"):
+        if file.suffix.lower() in IMAGES:
             with Image.open(file) as image:
                 pixels = np.asarray(image)
             return pixels.reshape(-1) if pixels.ndim == 2 else pixels.reshape(-1, pixels.shape[-1])[:, 0]

@@ -18,6 +18,7 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Mesh
 from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.errors import UserError
 from fb3d_rl.kinematics.tree import KinematicTree
+from tests.assets.test_partnet_mobility import refuse
 
 SOLID = trimesh.creation.box((0.5, 0.25, 1.0), transform=trimesh.transformations.translation_matrix((0.5, 1.0, 0.25)))
 """What the mesh files hold: numbers that every format keeps exactly."""
@@ -304,15 +305,6 @@ def test_followers_of_nothing(tmp_path: Path, mimic: str, hinge: str, says: str,
 
 
 # ------------------------------------------------------------------------------------------------ sentences
-
-
-def refuse(folder: Path) -> str:
-    """The sentence with which the object is refused; it names the object."""
-    with pytest.raises(UserError) as error:
-        load_object(folder)
-    sentence = str(error.value)
-    assert folder.name in sentence and "\n" not in sentence
-    return sentence
 
 
 @pytest.mark.parametrize(
