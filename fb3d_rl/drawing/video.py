@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,8 +20,10 @@ def require_encoder() -> None:
         UserError: there is no ffmpeg.
     """
     try:
+        import imageio_ffmpeg  # late: a machine that only trains has no need of it
+
         imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError as error:
+    except (ImportError, RuntimeError) as error:
         raise UserError("videos need ffmpeg; install it, or leave videos out: evaluation.videos=0") from error
 
 
@@ -47,6 +48,8 @@ def encode(images: Iterable[NDArray[np.uint8]], path: Path, size: tuple[int, int
         rate: pictures per second.
         hold: how long (s) the last one stays.
     """
+    import imageio_ffmpeg
+
     codec, pixels, options = _ENCODERS[path.suffix]
     same = "-threads 1 -filter_threads 1 -map_metadata -1 -fflags +bitexact -flags +bitexact".split()
     with replacing(path) as part:
