@@ -127,7 +127,8 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
     if cfg.data.dataset:
         require_unseen(Path(cfg.data.dataset), [*entries.validation, *entries.held_out])
     else:
-        draw_samples(cfg, [entry.folder for entry in entries.train], protocol.samples, out / SAMPLES)
+        drawn = [entry.folder for entry in entries.drawn(cfg.data.given_share)]
+        draw_samples(cfg, drawn, protocol.samples, out / SAMPLES)
     if met_by is not None:
         draw_rollout_samples(cfg, out, met_by, entries.train, protocol)
     wait_for_all()
@@ -136,13 +137,13 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
     def checkpoint(state: dict[str, Any]) -> None:
         save_checkpoint(out / CHECKPOINT, algo=cfg.algo.name, config=content(cfg), model_kwargs=net.arguments,
-                        state=state, seed=cfg.seed)  # fmt: skip
+                        state=state, seed=fit_seed(cfg))  # fmt: skip
 
     if resume is None:
         (out / BEST).unlink(missing_ok=True)
     with RunLog(out, resume_step=resume["step"] if resume else None, logger=logger) as run_log:
         fit(net, buffer, options, objective=kind.objective and kind.objective(net, options), device=device,
-            evaluate=partial(validate, kind, validation, device, out / BEST, cfg.seed), log=run_log.write,
+            evaluate=partial(validate, kind, validation, device, out / BEST, fit_seed(cfg)), log=run_log.write,
             on_checkpoint=checkpoint, resume=resume["state"] if resume else None)  # fmt: skip
 
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
@@ -260,7 +261,13 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
     rows += cfg.data.met_samples if cfg.data.met_by else 0
     epochs = min(algo.epochs, cfg.data.max_epochs or algo.epochs)
-    return taken(FitOptions, algo, steps=math.ceil(epochs * rows / algo.batch_size), seed=cfg.seed)
+    return taken(FitOptions, algo, steps=math.ceil(epochs * rows / algo.batch_size), seed=fit_seed(cfg))
+
+
+def fit_seed(cfg: TrainConfig) -> int:
+    """The seed of the fit, which may differ from that of the objects and samples."""
+    seed = cast("FlowNetworkOptions", cfg.algo).seed
+    return cfg.seed if seed is None else seed
 
 
 def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
@@ -270,7 +277,7 @@ def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
         UserError: the file holds another kind of network, or one that cannot propose several flows.
     """
     algo = cast("FlowNetworkOptions", cfg.algo)
-    generator = torch.Generator().manual_seed(cfg.seed)
+    generator = torch.Generator().manual_seed(fit_seed(cfg))
     if algo.hypotheses > 1 and kind.network is not ArtFlowNet:
         raise UserError(f"algo={algo.name} proposes one answer: leave algo.hypotheses=1")
     further: dict[str, Any] = {}

@@ -27,6 +27,11 @@ class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
         "passes over the training samples; steps = epochs * data.train_samples / batch_size",
         within="(0, inf)",
     )
+    seed: int | None = option(
+        None,
+        "of the first weights, the order of the samples and their augmentation; null: the run's, which objects and "
+        "samples have in any case",
+    )
     start_from: str | None = option(
         None, "weights to start from: a run folder, checkpoint.pt or .safetensors; null: random weights"
     )

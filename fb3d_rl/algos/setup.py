@@ -48,11 +48,27 @@ Config = TypeVar("Config", bound="CommandConfig")
 
 @dataclass(frozen=True)
 class TrainEntries:
-    """The objects of a training run in three disjoint lists: for training, validation and evaluation."""
+    """The objects of a training run in three disjoint lists: for training, validation and evaluation.
+
+    Attributes:
+        train, validation, held_out: these.
+        made: ids of those that are procedural.
+    """
 
     train: list[Entry]
     validation: list[Entry]
     held_out: list[Entry]
+    made: frozenset[str] = frozenset()
+
+    def drawn(self, given_share: float | None) -> list[Entry]:
+        """The training objects to draw flow samples of in turn: those that were given as often as it takes for about
+        this share of the samples to be theirs. None: each once.
+        """
+        given = [entry for entry in self.train if entry.id not in self.made]
+        made = [entry for entry in self.train if entry.id in self.made]
+        if given_share is None or not given or not made:
+            return self.train
+        return given * max(1, round(given_share / (1.0 - given_share) * len(made) / len(given))) + made
 
 
 def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
@@ -67,7 +83,10 @@ def train_entries(assets: AssetsOptions, out: Path, seed: int) -> TrainEntries:
     if assets.validation_share and not kept:
         print("note: too few training objects to keep one for validation; there is no validation during training")
     return TrainEntries(
-        [entry for entry in train if entry.id not in kept], [entry for entry in train if entry.id in kept], held_out
+        [entry for entry in train if entry.id not in kept],
+        [entry for entry in train if entry.id in kept],
+        held_out,
+        frozenset(entry.id for entry in made),
     )
 
 

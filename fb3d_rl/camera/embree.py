@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,20 @@ except ImportError as error:  # no wheel for this platform
 def _device() -> EmbreeDevice:
     """One device for all scenes: each takes one of the process's 1024 thread-local keys."""
     return EmbreeDevice()
+
+
+def use_one_thread() -> None:
+    """Let Embree build its scenes in the calling thread alone, if none was built yet: it would start as many threads as
+    there are cores, in each of as many worker processes. Has no effect outside Linux.
+    """
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})  # what it counts, once
+    try:
+        triangle_scene(np.eye(3, dtype=np.float32)[None]).run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+    finally:
+        os.sched_setaffinity(0, allowed)
 
 
 def triangle_scene(vertices: NDArray[np.float32], faces: NDArray[np.int32] | None = None) -> EmbreeScene:

@@ -17,6 +17,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl import contract
 from fb3d_rl.assets.partnet_mobility import content_of, load_object
+from fb3d_rl.camera.embree import use_one_thread
 from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.data.samples import SampleOptions, draw_sample
@@ -54,7 +55,7 @@ def generate_samples(
 
     Args:
         out: folder of the memory map; an unfinished one is drawn anew.
-        folders: PartNet-Mobility object folders.
+        folders: PartNet-Mobility object folders; of one that is listed k times, k times as many samples are drawn.
         count: number of samples S.
         seed: seed of all draws.
         options: how samples are drawn.
@@ -81,7 +82,14 @@ def generate_samples(
         return done
     empty_rows(out, count, options.points)
     owner = np.random.default_rng([seed, 0]).permutation(count) % len(folders)
-    jobs = [(out / "rows", folder, f, np.flatnonzero(owner == f), seed, options) for f, folder in enumerate(folders)]
+    first = {folder: f for f, folder in reversed(list(enumerate(folders)))}
+    owner = np.array([first[folder] for folder in folders])[owner]
+    order, starts = owner.argsort(kind="stable"), np.bincount(owner, minlength=len(folders)).cumsum()
+    rows_of = np.split(order, starts[:-1])
+    jobs = [
+        (out / "rows", folder, f, rows_of[f], seed, options)
+        for folder, f in sorted(first.items(), key=lambda item: item[1])
+    ]
     missing = _draw_objects(jobs, workers, progress)
     rows = TensorDict.load_memmap(out / "rows")
     _refill(rows, sorted(missing), count)
@@ -198,7 +206,9 @@ def _rows(folder: Path) -> TensorDictBase:
 
 
 def _quiet() -> None:
-    torch.set_num_threads(1)  # one thread a worker: the workers are the parallelism
+    # One thread a worker: the workers are the parallelism.
+    torch.set_num_threads(1)
+    use_one_thread()
 
 
 def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:

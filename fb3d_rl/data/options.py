@@ -58,6 +58,12 @@ class DataOptions(SampleOptions):
     """Flow samples, data sets of them, and the expert's labels."""
 
     train_samples: int = option(4000, "samples to train flow networks on")
+    given_share: float | None = option(
+        None,
+        "about which share of them shows real or other given objects, where procedural ones are trained on, too; null: "
+        "each object is shown equally often",
+        within="(0, 1)",
+    )
     max_epochs: float | None = option(
         None, "most passes over them, where algo.epochs asks for more; null: no limit", within="(0, inf)"
     )

@@ -14,7 +14,7 @@ LARGEST = 8192
 
 
 @triton.jit
-def sample(points, valid, chosen, count, n, block: tl.constexpr):  # type: ignore[no-untyped-def]
+def sample(points, valid, chosen, n, count: tl.constexpr, block: tl.constexpr):  # type: ignore[no-untyped-def]
     """One program for each cloud: points [B, n, 3] f32, valid [B, n] bool -> chosen [B, count] i64; ``block`` >= n."""
     cloud = tl.program_id(0).to(tl.int64)
     place = tl.arange(0, block)
@@ -44,5 +44,5 @@ def farthest_point_sample(points: Tensor, count: int, valid: Tensor) -> Tensor:
     warps = min(8, max(1, block // 256))
     # Triton launches on the current device, which need not be the points'.
     with torch.cuda.device_of(points):
-        sample[(clouds,)](points.float().contiguous(), valid.contiguous(), chosen, count, n, block, num_warps=warps)
+        sample[(clouds,)](points.float().contiguous(), valid.contiguous(), chosen, n, count, block, num_warps=warps)
     return chosen

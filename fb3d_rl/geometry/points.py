@@ -2,14 +2,15 @@
 
 Shapes: B clouds, N points each, M centres, K neighbours. ``valid`` is False on padding: a padding point is
 never sampled, grouped or interpolated from. All runs on CPU and CUDA in shapes that do not depend on the points, and
-gives the same bits every time on a CPU. It is plain PyTorch but for sampling on CUDA
-(:mod:`fb3d_rl.geometry.farthest_triton`).
+gives the same bits every time on a CPU. It is plain PyTorch but for sampling and neighbours on CUDA
+(:mod:`fb3d_rl.geometry.farthest_triton`, :mod:`fb3d_rl.geometry.neighbors_triton`).
 """
 
 from __future__ import annotations
 
 from functools import cache
 from importlib.util import find_spec
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,7 +22,7 @@ def _all_valid(points: Tensor, valid: Tensor | None) -> Tensor:
 
 
 @cache
-def _has_triton() -> bool:
+def has_triton() -> bool:
     """PyTorch brings Triton along for CUDA on Linux only."""
     return find_spec("triton") is not None
 
@@ -53,7 +54,7 @@ def farthest_point_sample(points: Tensor, count: int, valid: Tensor | None = Non
         Indices [B, count], int64. The first m of them are the answer to ``count=m``.
     """
     valid = _all_valid(points, valid)
-    if points.is_cuda and _has_triton():
+    if points.is_cuda and has_triton():
         from fb3d_rl.geometry import farthest_triton
 
         if points.shape[1] <= farthest_triton.LARGEST:
@@ -98,6 +99,11 @@ def ball_query(
         Free slots hold the ball's first neighbour (0 where the ball is empty).
     """
     valid = _all_valid(points, valid)
+    if points.is_cuda and has_triton():
+        from fb3d_rl.geometry import neighbors_triton
+
+        if points.shape[1] <= neighbors_triton.LARGEST:
+            return neighbors_triton.ball_query(points, centres, radius, count, valid)
     batch, rows = centres.shape[:2]
     inside_so_far = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
     # One cloud at a time on a CPU, so that its distances stay in the cache.
@@ -153,9 +159,18 @@ def three_nn(points: Tensor, queries: Tensor, valid: Tensor | None = None) -> tu
         Indices [B, M, 3] and weights [B, M, 3] that sum to 1 (0 in a cloud without valid points); fewer than
         three columns where N < 3.
     """
-    squared, index = knn(points, queries, 3, valid)
+    squared, index = _three_nearest(points, queries, _all_valid(points, valid))
     weight = squared.clamp_(min=1e-16).reciprocal_()
     return index, weight / weight.sum(2, keepdim=True).clamp_(min=torch.finfo(weight.dtype).tiny)
+
+
+def _three_nearest(points: Tensor, queries: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    if points.is_cuda and has_triton():
+        from fb3d_rl.geometry import neighbors_triton
+
+        if 3 <= points.shape[1] <= neighbors_triton.MOST_CENTRES:
+            return neighbors_triton.three_nearest(points, queries, valid)
+    return knn(points, queries, 3, valid)
 
 
 def gather(values: Tensor, index: Tensor) -> Tensor:
@@ -169,6 +184,36 @@ def take_rows(rows: Tensor, index: Tensor) -> Tensor:
     ``rows[index]``.
     """
     return functional.embedding(index, rows)
+
+
+def weighted_rows(rows: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    """Sums [Q, C] of the rows [P, C] at index [Q, K], weighted [Q, K]. The gradient's sums have no order on a GPU."""
+    sums: Tensor = _WeightedRows.apply(rows, index, weight)
+    return sums
+
+
+class _WeightedRows(torch.autograd.Function):
+    """Column by column of the index: no array has all [Q, K, C] rows."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+        """See :func:`weighted_rows`."""
+        weight = weight.to(rows.dtype)
+        ctx.save_for_backward(index, weight)
+        ctx.rows = len(rows)
+        total = rows.index_select(0, index[:, 0]) * weight[:, :1]
+        for k in range(1, index.shape[1]):
+            total.addcmul_(rows.index_select(0, index[:, k]), weight[:, k : k + 1])
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        """Each row's share of the gradients of the sums that it is in."""
+        index, weight = ctx.saved_tensors
+        total = gradient.new_zeros(ctx.rows, gradient.shape[1])
+        for k in range(index.shape[1]):
+            total.index_add_(0, index[:, k], gradient * weight[:, k : k + 1])
+        return total, None, None
 
 
 def pca_curvature(

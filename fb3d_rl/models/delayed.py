@@ -54,22 +54,28 @@ class PooledAbstraction(nn.Module):
         """
         points = fine.flat(fine.points)
         first, *others = self.before
-        own = first.activate(map_with_position(first, features, points))
+        own = first.activate(map_with_position(first, features, points), fine.present)
         for layer in others:
-            own = layer(own)
+            own = layer(own, fine.present)
         coarse, index, mask = fine.balls(self.ratio, self.radius, self.neighbors)
         best = pooled_max(map_with_position(self.pooled, own, points), index, mask)
         best = best - map_with_position(self.pooled, None, coarse.flat(coarse.points))
-        return own, self.after(self.pooled.activate(best)), coarse
+        return own, self.after(self.pooled.activate(best, coarse.present), coarse.present), coarse
 
 
 @eager
 def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
     """Maximum of rows [P, C] over each ball, index [Q, K] of which mask [Q, K] is real (the first of a ball always), ->
-    [Q, C].
+    [Q, C]; of a ball without any, that of its first slot.
     """
-    if rows.device.type != "cpu":  # what the free slots hold is in the ball, too
+    if rows.is_cuda and ops.has_triton():
+        from fb3d_rl.geometry.neighbors_triton import largest_rows
+
+        return largest_rows(rows, index)  # what the free slots hold is in the ball, too
+    if rows.device.type != "cpu":
         return ops.take_rows(rows, index).amax(1)
+    mask = mask.clone()
+    mask[:, 0] = True
     # A product with a sparse matrix of ones whose sums are maxima: no [Q, K, C] array.
     starts = functional.pad(mask.sum(1).cumsum(0), (1, 0))
     ones = torch.ones(int(starts[-1]), dtype=rows.dtype)
@@ -79,6 +85,8 @@ def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
 
 class DelayedPointNet2(PointwiseNet):
     """See the module; arguments as of :class:`fb3d_rl.models.pointnet2.PointNet2`."""
+
+    FIXED_SHAPES = True
 
     def __init__(self, inputs: int = 0, outputs: int = 3, neighbors: int = 64) -> None:
         super().__init__(outputs)
@@ -97,5 +105,6 @@ class DelayedPointNet2(PointwiseNet):
         whole = self.sa3(middle, level2)
         middle = self.fp3(whole, None, middle, level2)
         fine = self.fp2(middle, level2, fine, level1)
-        rows: Tensor = self.head(self.fp1(fine, level1, own, cloud))
+        layers, last = self.head
+        rows: Tensor = last(layers(self.fp1(fine, level1, own, cloud), cloud.present))
         return rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -24,14 +25,21 @@ class DenseLayer(nn.Module):
         self.linear = nn.Linear(inputs, outputs, bias=False)
         self.norm = nn.BatchNorm1d(outputs)
 
-    def activate(self, rows: Tensor) -> Tensor:
-        """The part after the linear map."""
-        normal: Tensor = self.norm(rows)
-        return functional.relu(normal, inplace=True)
+    def activate(self, rows: Tensor, present: Tensor | None = None) -> Tensor:
+        """The part after the linear map. If some rows are padding, ``present`` [B, 1, P / B] is 0 on them and 1 on the
+        others, and they have no part in batch norm's statistics.
+        """
+        if present is None or not self.norm.training:
+            normal: Tensor = self.norm(rows)
+            return functional.relu(normal, inplace=True)
+        norm = self.norm
+        output, mean, variance, count = _PaddedNorm.apply(rows, present, norm.weight, norm.bias, norm.eps)
+        self.track(mean, variance, count)
+        return output
 
-    def forward(self, rows: Tensor) -> Tensor:
-        """Rows [P, in] -> [P, out]."""
-        return self.activate(self.linear(rows))
+    def forward(self, rows: Tensor, present: Tensor | None = None) -> Tensor:
+        """Rows [P, in] -> [P, out]; ``present`` as of :meth:`activate`."""
+        return self.activate(self.linear(rows), present)
 
     def fixed_norm(self) -> tuple[Tensor, Tensor]:
         """Scale and shift [out] of batch norm in evaluation mode."""
@@ -40,13 +48,14 @@ class DenseLayer(nn.Module):
         return scale, self.norm.bias - mean * scale
 
     @torch.no_grad()
-    def track(self, mean: Tensor, variance: Tensor, rows: int) -> None:
-        """Update batch norm's running statistics by mean and biased variance [out] of the rows."""
+    def track(self, mean: Tensor, variance: Tensor, rows: int | Tensor) -> None:
+        """Update batch norm's running statistics by mean and biased variance [out] of so many rows."""
         running_mean, running_variance = self._running()
         momentum = self.norm.momentum
         assert momentum is not None
         running_mean.lerp_(mean, momentum)
-        running_variance.lerp_(variance * (rows / max(1, rows - 1)), momentum)
+        others = (rows - 1).clamp(min=1) if isinstance(rows, Tensor) else max(1, rows - 1)
+        running_variance.lerp_(variance * (rows / others), momentum)
         assert self.norm.num_batches_tracked is not None
         self.norm.num_batches_tracked.add_(1)
 
@@ -65,6 +74,52 @@ class DenseMLP(nn.Sequential):
     def __iter__(self) -> Iterator[DenseLayer]:
         """The layers, first to last."""
         return iter(self._modules.values())  # type: ignore[arg-type]
+
+    def forward(self, rows: Tensor, present: Tensor | None = None) -> Tensor:
+        """Rows [P, in] -> [P, out]; ``present`` as of :meth:`DenseLayer.activate`."""
+        for layer in self:
+            rows = layer(rows, present)
+        return rows
+
+
+class _PaddedNorm(torch.autograd.Function):
+    """Batch norm of the rows that are present, and ReLU. Sums over rows are products with their presence, cloud by
+    cloud: one pass over memory each.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, rows: Tensor, present: Tensor, scale: Tensor, shift: Tensor, eps: float
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Rows [P, C] -> the same shape, and the statistics."""
+        kind, rows = rows.dtype, rows.to(torch.promote_types(rows.dtype, torch.float32))
+        count = present.sum()
+        mean = _sum(rows, present) / count
+        centred = rows - mean
+        variance = _sum(centred.square(), present) / count
+        inverse = (variance + eps).rsqrt()
+        output = torch.addcmul(shift, centred, scale * inverse).relu_()
+        ctx.save_for_backward(centred, output, present, scale, inverse, count)
+        ctx.kind = kind
+        ctx.mark_non_differentiable(mean, variance, count)
+        return output.to(kind), mean, variance, count
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        """The chain rule through ReLU and batch norm: scale * (dz - mean(dz) - xhat mean(dz xhat))."""
+        centred, output, present, scale, inverse, count = ctx.saved_tensors
+        gradient = torch.ops.aten.threshold_backward(gradient.to(output.dtype), output, 0)
+        d_shift = _sum(gradient, present)
+        d_scale = _sum(gradient * centred, present) * inverse
+        d_rows = torch.addcmul(gradient - d_shift / count, centred, inverse * d_scale / -count)
+        d_rows = d_rows.mul_(scale * inverse).mul_(present.view(-1, 1))
+        return d_rows.to(ctx.kind), None, d_scale, d_shift, None
+
+
+def _sum(rows: Tensor, present: Tensor) -> Tensor:
+    """Sum [C] of the rows [P, C] that are present [B, 1, P / B]."""
+    with torch.autocast(rows.device.type, enabled=False):
+        return torch.bmm(present, rows.view(len(present), -1, rows.shape[1])).sum((0, 1))
 
 
 def initialize(net: nn.Module, generator: torch.Generator) -> None:

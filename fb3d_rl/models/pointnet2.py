@@ -38,8 +38,10 @@ class Level:
         points: [B, N, 3] m.
         valid: [B, N] bool.
         row: [B, N] the point's row among all valid points of the batch; on padding, of some other point.
-        total: P, the number of valid points.
+        total: P, the number of rows.
         farthest: the points come in the order of farthest point sampling.
+        present: [B, 1, N] f32, 0 on padding, if each point has a row, so that no shape depends on the clouds; None if
+            only the valid ones have.
     """
 
     points: Tensor
@@ -47,11 +49,15 @@ class Level:
     row: Tensor
     total: int
     farthest: bool = False
+    present: Tensor | None = None
 
     @classmethod
     @eager
-    def of(cls, points: Tensor, valid: Tensor, farthest: bool = False) -> Level:
-        """Number the valid points."""
+    def of(cls, points: Tensor, valid: Tensor, farthest: bool = False, fixed: bool = False) -> Level:
+        """Number the valid points, or with ``fixed`` all of them."""
+        if fixed:
+            row = torch.arange(valid.numel(), device=valid.device).view_as(valid)
+            return cls(points, valid, row, valid.numel(), farthest, valid[:, None].to(points.dtype))
         row = valid.flatten().cumsum(0).view_as(valid)
         return cls(points, valid, (row - 1).clamp_(min=0), int(row[-1, -1]), farthest)
 
@@ -63,6 +69,8 @@ class Level:
     @eager
     def padded(self, rows: Tensor) -> Tensor:
         """Rows [P, C] -> [B, N, C], 0 on padding."""
+        if self.present is not None:
+            return rows.view(*self.valid.shape, -1).masked_fill(~self.valid[..., None], 0.0)
         if self.total == self.valid.numel():
             return rows.view(*self.valid.shape, -1)
         output = rows.new_zeros(*self.valid.shape, rows.shape[1])
@@ -77,16 +85,19 @@ class Level:
         else:
             points = ops.gather(self.points, ops.farthest_point_sample(self.points, most, self.valid))
         count = torch.ceil(self.valid.sum(1, keepdim=True) * ratio)
-        return Level.of(points, torch.arange(most, device=points.device) < count, farthest=True)
+        kept = torch.arange(most, device=points.device) < count
+        return Level.of(points, kept, farthest=True, fixed=self.present is not None)
 
     @eager
     @torch.no_grad()
     def balls(self, ratio: float, radius: float, neighbors: int) -> tuple[Level, Tensor, Tensor]:
         """Coarser points, and around each [Q] at most K of these points: their rows [Q, K], real where a mask [Q, K] is
-        (first in each row; the other slots repeat the first).
+        (first in each row; the other slots repeat the first). Nothing is in the balls of padding.
         """
         coarse = self.coarser(ratio)
         index, mask = ops.ball_query(self.points, coarse.points, radius, neighbors, self.valid)
+        if self.present is not None:
+            mask &= coarse.valid[..., None]
         rows = self.row.gather(1, index.flatten(1)).view_as(index)
         return coarse, coarse.flat(rows), coarse.flat(mask)
 
@@ -152,10 +163,11 @@ class GlobalAbstraction(nn.Module):
 
     def forward(self, features: Tensor, level: Level) -> Tensor:
         """Features [Q, inputs] -> [B, widths[-1]]; 0 for a cloud without points."""
-        rows = self.layers(torch.cat([features, level.flat(level.points)], 1))
-        padded = ops.take_rows(rows, level.row)
+        rows = self.layers(torch.cat([features, level.flat(level.points)], 1), level.present)
         # Features after ReLU are not negative, so that 0 is neutral in the maximum.
-        return padded.masked_fill(~level.valid[..., None], 0.0).amax(1)
+        if level.present is not None:
+            return level.padded(rows).amax(1)
+        return ops.take_rows(rows, level.row).masked_fill(~level.valid[..., None], 0.0).amax(1)
 
 
 class FeaturePropagation(nn.Module):
@@ -181,7 +193,9 @@ class FeaturePropagation(nn.Module):
         first, *others = self.layers
         weight = first.linear.weight
         rows = features @ weight[:, : self.inputs].T
-        if coarse is None:
+        if fine.present is not None:
+            rows = self._carried(rows, coarse, fine)
+        elif coarse is None:
             clouds = torch.arange(len(rows), device=rows.device)[:, None].expand_as(fine.valid)
             rows = ops.take_rows(rows, fine.flat(clouds))
         else:
@@ -189,10 +203,18 @@ class FeaturePropagation(nn.Module):
             rows = functional.embedding_bag(index, rows, per_sample_weights=share.to(rows.dtype), mode="sum")
         if skip is not None:
             rows = rows + skip @ weight[:, self.inputs :].T
-        rows = first.activate(rows)
+        rows = first.activate(rows, fine.present)
         for layer in others:
-            rows = layer(rows)
+            rows = layer(rows, fine.present)
         return rows
+
+    @staticmethod
+    def _carried(rows: Tensor, coarse: Level | None, fine: Level) -> Tensor:
+        """Rows of the coarse points at the fine ones, where each point has a row."""
+        if coarse is None:
+            return rows[:, None].expand(-1, fine.valid.shape[1], -1).flatten(0, 1)
+        index, share = coarse.nearest(fine)
+        return ops.weighted_rows(rows, index, share)
 
 
 class PointwiseNet(nn.Module):
@@ -203,9 +225,13 @@ class PointwiseNet(nn.Module):
         padding.
     """
 
+    FIXED_SHAPES = False
+    """Whether it can compute in shapes that do not depend on the clouds, as a CUDA graph needs."""
+
     def __init__(self, outputs: int) -> None:
         super().__init__()
         self.outputs = outputs
+        self.fixed_shapes = False
 
     def rows(self, features: Tensor | None, cloud: Level) -> Tensor:
         """Features [P, inputs] of the valid points -> [P, outputs]; P > 0."""
@@ -213,7 +239,7 @@ class PointwiseNet(nn.Module):
 
     def forward(self, points: Tensor, valid: Tensor, features: Tensor | None = None) -> Tensor:
         """See the class."""
-        cloud = Level.of(points, valid)
+        cloud = Level.of(points, valid, fixed=self.fixed_shapes)
         if cloud.total == 0:
             return points.new_zeros(*valid.shape, self.outputs)
         return cloud.padded(self.rows(None if features is None else cloud.flat(features), cloud))

@@ -70,7 +70,8 @@ def augment(batch: TensorDictBase, options: FitOptions, step: int, share: slice 
         valid = valid & (draw(5, points.shape[1]) >= options.dropout * draw(6, 1))
         part_mask, flow = part_mask & valid, flow * valid[..., None]
     observation = {"points": points, "valid": valid, "part_mask": part_mask}
-    return TensorDict({"observation": observation, "privileged": {"flow": flow}}, batch_size=batch.batch_size)
+    privileged = batch["privileged"].to_dict() | {"flow": flow}
+    return TensorDict({"observation": observation, "privileged": privileged}, batch_size=batch.batch_size)
 
 
 def rotate_about_z(vectors: Tensor, angle: Tensor) -> Tensor:

@@ -114,8 +114,11 @@ def _prepare(
     if resume is not None:
         state.load_state_dict(resume)
 
+    # Where rows lie on the card, their numbers go there once, and not for each of a row's tensors.
+    place = (buffer.device or "cpu") if isinstance(buffer, TensorDictBase) else "cpu"
+
     def draw(step: int) -> TensorDictBase:
-        return buffer[batch_rows(step, rows, options)[share]].to(device)
+        return buffer[batch_rows(step, rows, options)[share].to(place)].to(device)
 
     return state, objective, draw
 

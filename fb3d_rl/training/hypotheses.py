@@ -20,6 +20,9 @@ RELAXATION = 0.05
 SCORE_WEIGHT = 0.02
 """Weight of the scores' cross-entropy beside the squared error of the flow."""
 
+LINKS = 256
+"""Links of an object that are told apart; those behind count as one."""
+
 
 def hypotheses_loss(found: Hypotheses, target: Tensor, valid: Tensor, link: Tensor) -> Tensor:
     """Relaxed winner-takes-all loss of K hypotheses, with the cross-entropy of their scores.
@@ -38,15 +41,16 @@ def hypotheses_loss(found: Hypotheses, target: Tensor, valid: Tensor, link: Tens
     squared = (flows - target[:, None]).square().sum(3)  # [B, K, N]
     moving = valid & (target.norm(dim=2) > MOVING_NORM)
     still = squared.mean(1).masked_fill(~valid | moving, 0.0).sum()
-    # One number for each (cloud, link) that moves.
-    cloud = torch.arange(len(link), device=link.device)[:, None].expand_as(link)
-    parts, part = torch.unique(torch.stack([cloud[moving], link[moving]]), dim=1, return_inverse=True)
-    of_points = squared.transpose(1, 2)[moving]  # [P, K]
-    errors = of_points.new_zeros(parts.shape[1], count).index_add_(0, part, of_points)
-    winner = errors.argmin(1)
+    # One row for each link of each cloud, which holds zeros if the link does not move.
+    cloud = torch.arange(len(link), device=link.device)[:, None]
+    part = (cloud * LINKS + link.long().clamp(0, LINKS - 1)).flatten()
+    of_points = squared.masked_fill(~moving[:, None], 0.0).transpose(1, 2).flatten(0, 1)  # [B N, K]
+    errors = of_points.new_zeros(len(link) * LINKS, count).index_add_(0, part, of_points)
+    points = valid.sum().clamp(min=1)
     if count == 1:
-        return (still + errors.sum()) / valid.sum().clamp(min=1)
+        return (still + errors.sum()) / points
+    winner = errors.argmin(1)
     weights = torch.full_like(errors, RELAXATION / (count - 1)).scatter_(1, winner[:, None], 1.0 - RELAXATION)
-    flow_error = (still + (weights * errors).sum()) / valid.sum().clamp(min=1)
-    scores = log_probabilities.transpose(1, 2)[moving].gather(1, winner[part][:, None])
+    flow_error = (still + (weights * errors).sum()) / points
+    scores = log_probabilities.gather(1, winner[part].view(len(link), 1, -1)).squeeze(1).masked_fill(~moving, 0.0)
     return flow_error - SCORE_WEIGHT * scores.sum() / moving.sum().clamp(min=1)

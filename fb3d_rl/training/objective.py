@@ -10,8 +10,10 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from fb3d_rl.models.artflownet import Hypotheses, proposes_several
+from fb3d_rl.models.cloud_network import CloudNetwork
 from fb3d_rl.training.device import products_of
 from fb3d_rl.training.draws import augment
+from fb3d_rl.training.graph import GraphedLoss
 from fb3d_rl.training.hypotheses import hypotheses_loss
 from fb3d_rl.training.options import FitOptions
 
@@ -30,24 +32,42 @@ def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
 
 
 def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
-    """The loss of a flow network on clouds that are augmented according to the options.
+    """The loss of a flow network (:func:`cloud_loss`) on clouds that are augmented according to the options.
 
-    It is :func:`flow_loss`, and :func:`~fb3d_rl.training.hypotheses.hypotheses_loss` of a network that proposes several
-    flows. ``share`` is the part of the whole batch that the objective is called with.
+    ``share`` is the part of the whole batch that the objective is called with. On a GPU with ``options.graph``, forward
+    and backward are one launch (:class:`~fb3d_rl.training.graph.GraphedLoss`), if the network can do so.
+    """
+    loss = cloud_loss(model, options)
+    if (
+        options.graph
+        and not options.compile
+        and isinstance(model, CloudNetwork)
+        and model.network.FIXED_SHAPES
+        and next(model.parameters()).is_cuda
+    ):
+        loss = GraphedLoss(model, loss)
+
+    def objective(batch: TensorDictBase, step: int) -> Tensor:
+        return loss(augment(batch, options, step, share))
+
+    return objective
+
+
+def cloud_loss(model: nn.Module, options: FitOptions) -> Callable[[TensorDictBase], Tensor]:
+    """:func:`flow_loss` of a flow network on flow samples [B], and
+    :func:`~fb3d_rl.training.hypotheses.hypotheses_loss` of one that proposes several flows.
     """
     network = model.module if isinstance(model, DistributedDataParallel) else model
     several = proposes_several(network)
 
-    def objective(batch: TensorDictBase, step: int) -> Tensor:
-        link = batch["privileged", "link"] if several else None
-        batch = augment(batch, options, step, share)
+    def loss(batch: TensorDictBase) -> Tensor:
         points, valid = batch["observation", "points"], batch["observation", "valid"]
         inputs, target = (points, valid, batch["observation", "part_mask"]), batch["privileged", "flow"]
         with products_of(options, points.device):
             predicted = model(*inputs, propose=True) if several else model(*inputs)
-        if link is None:
+        if not several:
             return flow_loss(predicted.float(), target, valid)
         found = Hypotheses(predicted.flows.float(), predicted.log_probabilities.float())
-        return hypotheses_loss(found, target, valid, link)
+        return hypotheses_loss(found, target, valid, batch["privileged", "link"])
 
-    return objective
+    return loss

@@ -54,6 +54,11 @@ class FlowFitOptions(OptimizerOptions):
     compile: bool = option(
         False, "run the layers of a network's PointNet++ through torch.compile, which pays on GPUs at most"
     )
+    graph: bool = option(
+        True,
+        "on a GPU, launch a step's loss and gradients as one CUDA graph, with backbone=delayed; the order of sums is then "
+        "not always the same",
+    )
     evaluate_every: int | None = option(
         None, "from one validation to the next; null: only at the end", "steps", "[1, inf)"
     )

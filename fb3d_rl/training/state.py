@@ -44,7 +44,8 @@ class FitState:
             group["lr"] = learning_rate(self.step, self.options)
         self.optimizer.zero_grad()
         value = objective(batch, self.step)
-        value.backward()
+        if value.requires_grad:  # else the objective has left the gradients in place
+            value.backward()
         if self.options.clip_norm is not None:
             nn.utils.clip_grad_norm_(self.model.parameters(), self.options.clip_norm)
         self.optimizer.step()
