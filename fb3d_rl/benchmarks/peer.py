@@ -38,7 +38,7 @@ class PeerPointNet2(nn.Module):
 
     def forward(self, points: Tensor, valid: Tensor, part_mask: Tensor) -> Tensor:
         """Points [B, N, 3], valid and part_mask [B, N] -> flow [B, N, 3]."""
-        cloud0 = torch.arange(len(points))[:, None].expand_as(valid)[valid]
+        cloud0 = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)[valid]
         points0, features0 = points[valid], part_mask[valid].float()[:, None]
         features1, points1, cloud1 = self.sa1(features0, points0, cloud0)
         features2, points2, cloud2 = self.sa2(features1, points1, cloud1)

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from fb3d_rl.geometry.points import has_triton
+
 eager = torch.compiler.disable
 """Keeps a function out of a compiled network: its loops are long, or the shapes of its results follow from values."""
 
@@ -93,13 +95,18 @@ class _PaddedNorm(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Rows [P, C] -> the same shape, and the statistics."""
         kind, rows = rows.dtype, rows.to(torch.promote_types(rows.dtype, torch.float32))
-        count = present.sum()
-        mean = _sum(rows, present) / count
-        centred = rows - mean
-        variance = _sum(centred.square(), present) / count
-        inverse = (variance + eps).rsqrt()
-        output = torch.addcmul(shift, centred, scale * inverse).relu_()
-        ctx.save_for_backward(centred, output, present, scale, inverse, count)
+        if rows.is_cuda and has_triton():
+            from fb3d_rl.models import norm_triton
+
+            rows = rows.contiguous()
+            output, mean, variance, count = norm_triton.normalized(rows, present.flatten(), scale, shift, eps)
+        else:
+            count = present.sum()
+            mean = _sum(rows, present) / count
+            centred = rows - mean
+            variance = _sum(centred.square(), present) / count
+            output = torch.addcmul(shift, centred, scale * (variance + eps).rsqrt()).relu_()
+        ctx.save_for_backward(rows, output, present, scale, mean, (variance + eps).rsqrt(), count)
         ctx.kind = kind
         ctx.mark_non_differentiable(mean, variance, count)
         return output.to(kind), mean, variance, count
@@ -107,12 +114,22 @@ class _PaddedNorm(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         """The chain rule through ReLU and batch norm: scale * (dz - mean(dz) - xhat mean(dz xhat))."""
-        centred, output, present, scale, inverse, count = ctx.saved_tensors
-        gradient = torch.ops.aten.threshold_backward(gradient.to(output.dtype), output, 0)
-        d_shift = _sum(gradient, present)
-        d_scale = _sum(gradient * centred, present) * inverse
-        d_rows = torch.addcmul(gradient - d_shift / count, centred, inverse * d_scale / -count)
-        d_rows = d_rows.mul_(scale * inverse).mul_(present.view(-1, 1))
+        rows, output, present, scale, mean, inverse, count = ctx.saved_tensors
+        gradient = gradient.to(output.dtype)
+        if rows.is_cuda and has_triton():
+            from fb3d_rl.models import norm_triton
+
+            gradient = gradient.contiguous()
+            d_rows, d_scale, d_shift = norm_triton.gradients(
+                gradient, rows, output, present.flatten(), mean, inverse, scale
+            )
+        else:
+            gradient = torch.ops.aten.threshold_backward(gradient, output, 0)
+            centred = rows - mean
+            d_shift = _sum(gradient, present)
+            d_scale = _sum(gradient * centred, present) * inverse
+            d_rows = torch.addcmul(gradient - d_shift / count, centred, inverse * d_scale / -count)
+            d_rows = d_rows.mul_(scale * inverse).mul_(present.view(-1, 1))
         return d_rows.to(ctx.kind), None, d_scale, d_shift, None
 
 

@@ -81,9 +81,25 @@ class Grouping:
 
     def sum_by_point(self, table: Tensor, slots: Tensor | None = None, weight: Tensor | None = None) -> Tensor:
         """Sum rows of a table over the slots of each point: table row = slot, or ``slots[slot]``."""
+        if _at_once(table):
+            rows = table if slots is None else table[slots]
+            rows = rows if weight is None else rows * weight[:, None].to(table.dtype)
+            return table.new_zeros(len(self.point_start), table.shape[1]).index_add_(0, self.source, rows)
         index = self.by_point if slots is None else slots[self.by_point]
         share = None if weight is None else weight[self.by_point].to(table.dtype)
         return functional.embedding_bag(index, table, self.point_start, mode="sum", per_sample_weights=share)
+
+    def sum_by_ball(self, table: Tensor) -> Tensor:
+        """Sum rows of a table, one for each point, over the real points of each ball -> [Q, C]."""
+        if _at_once(table):
+            (block,) = self.blocks
+            return self.weigh(table[self.source], block).view(block.balls, block.width, -1).sum(1)
+        return functional.embedding_bag(self.source, table, self.ball_start, mode="sum", per_sample_weights=self.weight)
+
+
+def _at_once(rows: Tensor) -> bool:
+    """Whether all balls are one block: a GPU has no cache to stay in, and adds where embedding_bag would gather."""
+    return rows.is_cuda
 
 
 def make_grouping(index: Tensor, mask: Tensor, points: int) -> Grouping:
@@ -94,7 +110,7 @@ def make_grouping(index: Tensor, mask: Tensor, points: int) -> Grouping:
     ball_size, order = mask.sum(1).sort(descending=True, stable=True)
     index, mask = index[order], mask[order]
     sizes = ball_size.tolist()
-    block_rows = _BLOCK_ROWS if device.type == "cpu" else index.numel()
+    block_rows = index.numel() if _at_once(index) else _BLOCK_ROWS
     blocks, sources, weights, starts = [], [], [], []
     first = slot = 0
     while first < len(sizes):
@@ -138,7 +154,7 @@ class _GroupedMax(torch.autograd.Function):
         # Layer 1: the statistics of U_j - V_i from sums over points and centres only.
         ball_size = group.ball_size[:, None]
         point_size = group.sum_by_point(weight[:, None])
-        near_points = functional.embedding_bag(group.source, u, group.ball_start, mode="sum", per_sample_weights=weight)
+        near_points = group.sum_by_ball(u)
         ud, vd = u.double(), v.double()
         mean1 = ((point_size * ud).sum(0) - (ball_size * vd).sum(0)) / pairs
         square = (point_size * ud * ud).sum(0) + (vd * (ball_size * vd - 2 * near_points)).sum(0)
@@ -172,8 +188,8 @@ class _GroupedMax(torch.autograd.Function):
         for block in group.blocks:
             x2 = torch.addcmul(shift2, y2[block.part], scale2).relu_()
             y3 = (x2 @ w3s.T).view(block.balls, block.width, -1)
-            torch.amax(y3, 1, out=best[block.here])
-            winner[block.here] = _first_at(y3, best[block.here]) + group.ball_start[block.here, None]
+            best[block.here], place = _largest(y3)
+            winner[block.here] = place + group.ball_start[block.here, None]
             weighted = group.weigh(x2, block)
             moment1 += weighted.sum(0)
             moment2 += weighted.T @ x2
@@ -223,19 +239,11 @@ class _GroupedMax(torch.autograd.Function):
         dense = w3s.T @ w3_slope
         dense_shift = level @ w3s
         d_w3 = -(torch.outer(level, moment1) + w3_slope @ moment2) * pairs
-        sparse_order = winner.flatten().sort(stable=True).indices
-        won = winner.flatten().bincount(minlength=len(weight))
-        dz = functional.embedding_bag(
-            sparse_order % w3s.shape[0], w3s, won.cumsum(0) - won, mode="sum",
-            per_sample_weights=sparse.flatten()[sparse_order],
-        )  # fmt: skip
+        dz = _behind_winners(winner, sparse, w3s, len(weight))
         d_b2, d_g2 = (u.new_zeros(w2.shape[0], dtype=torch.float64) for _ in range(2))
         for block in group.blocks:
             x2 = torch.addcmul(shift2, y2[block.part], scale2).relu_()
-            d_w3 += functional.embedding_bag(
-                (winner[block.here] - block.part.start).T.contiguous(), x2, mode="sum",
-                per_sample_weights=sparse[block.here].T.contiguous(),
-            )  # fmt: skip
+            d_w3 += _with_winners(winner[block.here] - block.part.start, sparse[block.here], x2)
             d = dz[block.part]
             d -= group.weigh(torch.addmm(dense_shift, x2, dense), block)
             _mask_by_relu(d, x2)
@@ -279,16 +287,42 @@ def _first_layer(group: Grouping, u: Tensor, v: Tensor) -> Iterator[tuple[Block,
         yield block, x.view(block.balls * block.width, -1).relu_()
 
 
-def _first_at(values: Tensor, maximum: Tensor) -> Tensor:
-    """Where values [Q, K, C] first reach their maximum [Q, C] over K -> [Q, C]; overwrites the values.
+def _largest(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Maximum [Q, C] of values [Q, K, C] over K, and where it is [Q, C]: first on a CPU. Overwrites the values.
 
     The indices of ``torch.max`` over a middle dimension take six times as long on a CPU.
     """
-    width = values.shape[1]
+    if _at_once(values):
+        best, place = values.max(1)
+        return best, place
+    maximum, width = values.amax(1), values.shape[1]
     countdown = torch.arange(width, 0, -1, device=values.device, dtype=values.dtype)[:, None]
     values -= maximum[:, None]
     torch.add(countdown, values, alpha=1e38, out=values)  # any difference but 0 outweighs the place
-    return width - values.amax(1).long().clamp_(1, width)
+    return maximum, width - values.amax(1).long().clamp_(1, width)
+
+
+def _behind_winners(winner: Tensor, gradient: Tensor, weights: Tensor, slots: int) -> Tensor:
+    """Gradient [slots, C2] of the last layer's inputs from that of its maxima [Q, C3], of which ``winner`` names the slot;
+    weights [C3, C2].
+    """
+    if _at_once(gradient):
+        return gradient.new_zeros(slots, gradient.shape[1]).scatter_(0, winner, gradient) @ weights
+    order = winner.flatten().sort(stable=True).indices
+    won = winner.flatten().bincount(minlength=slots)
+    return functional.embedding_bag(
+        order % weights.shape[0], weights, won.cumsum(0) - won, mode="sum",
+        per_sample_weights=gradient.flatten()[order],
+    )  # fmt: skip
+
+
+def _with_winners(winner: Tensor, gradient: Tensor, inputs: Tensor) -> Tensor:
+    """Gradient [C3, C2] of the last layer's weights from that of its maxima [Q, C3]; inputs [slots, C2]."""
+    if _at_once(gradient):
+        return gradient.new_zeros(len(inputs), gradient.shape[1]).scatter_(0, winner, gradient).T @ inputs
+    return functional.embedding_bag(
+        winner.T.contiguous(), inputs, mode="sum", per_sample_weights=gradient.T.contiguous()
+    )
 
 
 def _mask_by_relu(gradient: Tensor, activation: Tensor) -> None:

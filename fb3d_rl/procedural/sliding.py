@@ -115,7 +115,8 @@ def tray(rng: np.random.Generator) -> ObjectSpec:
     half, tall, deep = rng.uniform(0.35, 0.8), rng.uniform(0.3, 1.1), rng.uniform(0.5, 1.2)
     sheet = rng.uniform(0.02, 0.05)
     count = int(rng.integers(1, 5))
-    slot = rng.uniform(0.05, min(0.2, 0.5 * tall / count))
+    highest = min(0.2, 0.5 * tall / count)
+    slot = rng.uniform(0.05 if highest > 0.05 else 0.7 * highest, highest)
     wide = rng.uniform(0.5, 0.95) * (half - sheet)
     x, y = (-half, half), (0.0, tall)
     pitch_y = (tall - 2 * sheet) / count

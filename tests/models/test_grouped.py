@@ -36,9 +36,12 @@ def naive(layer: SetAbstraction, points: torch.Tensor, valid: torch.Tensor, feat
     return torch.stack([part.amax(0) for part in rows.split(balls)])
 
 
-@pytest.mark.parametrize("block_rows", [16, 4096])
-def test_equals_naive_forward_backward_and_statistics(block_rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grouped, "_BLOCK_ROWS", block_rows)
+@pytest.mark.parametrize("block_rows", [16, 4096, None])
+def test_equals_naive_forward_backward_and_statistics(block_rows: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    if block_rows is None:  # as on a GPU
+        monkeypatch.setattr(grouped, "_at_once", lambda rows: True)
+    else:
+        monkeypatch.setattr(grouped, "_BLOCK_ROWS", block_rows)
     results = []
     for fast in (True, False):
         layer, points, valid, features = make_case()
