@@ -51,6 +51,7 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "experiment/comparison_partnet"): ["assets.root=."],
     ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
     ("train", "experiment/partnet_long"): ["assets.root=."],
+    **{("serve", f"assets/{name}"): ["assets.root=."] for name in ("partnet_mobility", "files", "mixed")},
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/flowbotpp"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
