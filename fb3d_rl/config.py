@@ -140,6 +140,8 @@ def validate(cfg: CommandConfig) -> None:
         _validate_training(cfg)
     if isinstance(cfg, EvaluateConfig | ServeConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
         raise UserError(f"policy={acting} needs checkpoint=PATH, a run folder of launch/train.py or its checkpoint.pt")
+    if REGISTRY[cfg.policy.name].outside != bool(cfg.policy.target):
+        raise UserError("policy=plugin and policy.target=package.module:make, a policy of your own, go together")
     if isinstance(cfg, ViewConfig):
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:
@@ -178,6 +180,8 @@ def _validate_training(cfg: TrainConfig) -> None:
     algo = cfg.algo
     one_of("algo.name", algo.name, registry.trained())
     if isinstance(algo, FlowNetworkOptions):
+        if algo.network and algo.name != "artflownet":
+            raise UserError(f"algo.network={algo.network} is for algo=artflownet")
         if not REGISTRY[algo.name].maskless and not algo.part_mask_input:
             raise UserError(f"algo={algo.name} is of one part, which the mask shows: leave algo.part_mask_input=true")
         needs_mask = algo.part_mask_input and not cfg.data.unmasked_share

@@ -27,7 +27,7 @@ def task(cfg: Any, out: Path) -> None:
 
     device = setup.choose_device(cfg.device)
     checkpoint = cfg.checkpoint if REGISTRY[cfg.policy.name].trained else None
-    chosen = acting(cfg.policy.name, checkpoint)
+    chosen = acting(cfg.policy.name, checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)
     limits, options = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     network = chosen.network.to(device) if isinstance(chosen.network, ArtFlowNet) else None
