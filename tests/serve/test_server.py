@@ -229,15 +229,17 @@ def test_the_command_ends_cleanly(tmp_path: Any, acting: dict[str, Any], number:
 def test_twenty_times_a_second_for_a_minute(
     port: int, client: type[WebsocketClientPolicy], acting: dict[str, Any]
 ) -> None:
-    robot, late, period = client(HERE, port), 0, 0.05
+    robot, period, trips, behind = client(HERE, port), 0.05, [], []
     began = time.perf_counter()
     for step in range(1200):
         tool = [-1.6 + 0.001 * step, 0.1, 0.8, 1.0, 0.0, 0.0, 0.0]
+        asked = time.perf_counter()
         robot.infer({**acting, "tool_pose": tool})
-        left = began + (step + 1) * period - time.perf_counter()
-        late += left < 0
-        time.sleep(max(0.0, left))
-    assert time.perf_counter() - began < 61 and late < 60
+        trips.append(time.perf_counter() - asked)
+        behind.append(time.perf_counter() - (began + (step + 1) * period))
+        time.sleep(max(0.0, -behind[-1]))
+    # Other work on the machine may hold up a few; a server that is too slow would fall behind more and more.
+    assert statistics.median(trips) < period and max(behind) < 1.0
 
 
 @pytest.mark.slow
