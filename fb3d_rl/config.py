@@ -73,7 +73,28 @@ class ViewConfig(CommandConfig):
     )
 
 
-COMMANDS: dict[str, type[CommandConfig]] = {"train": TrainConfig, "evaluate": EvaluateConfig, "view": ViewConfig}
+@dataclass(frozen=True)
+class ServeConfig(CommandConfig):
+    """Everything that launch/serve.py needs."""
+
+    checkpoint: str | None = option(
+        "pretrained", "weights of the policy: a run folder, a file, or pretrained; not read by one that has none"
+    )
+    host: str = option("127.0.0.1", "address that is listened on; only this machine reaches the default")
+    port: int = option(8000, "port; 0: any free one", within="[0, 65535]")
+    token: str | None = option(
+        None, "what clients have to give as api_key, '${oc.env:NAME}' for a variable of the environment; null: nothing"
+    )
+    megabytes: float = option(16.0, "size of the largest message that is read", "MiB", "(0, 2047]")
+    clients: int = option(8, "clients that are served at once", within="[1, inf)")
+
+
+COMMANDS: dict[str, type[CommandConfig]] = {
+    "train": TrainConfig,
+    "evaluate": EvaluateConfig,
+    "view": ViewConfig,
+    "serve": ServeConfig,
+}
 
 
 def algorithms() -> dict[str, type[AlgoOptions]]:
@@ -117,8 +138,10 @@ def validate(cfg: CommandConfig) -> None:
         one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         acting = cfg.algo.name
         _validate_training(cfg)
-    if isinstance(cfg, EvaluateConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
+    if isinstance(cfg, EvaluateConfig | ServeConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
         raise UserError(f"policy={acting} needs checkpoint=PATH, a run folder of launch/train.py or its checkpoint.pt")
+    if REGISTRY[cfg.policy.name].outside != bool(cfg.policy.target):
+        raise UserError("policy=plugin and policy.target=package.module:make, a policy of your own, go together")
     if isinstance(cfg, ViewConfig):
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:
@@ -157,6 +180,8 @@ def _validate_training(cfg: TrainConfig) -> None:
     algo = cfg.algo
     one_of("algo.name", algo.name, registry.trained())
     if isinstance(algo, FlowNetworkOptions):
+        if algo.network and algo.name != "artflownet":
+            raise UserError(f"algo.network={algo.network} is for algo=artflownet")
         if not REGISTRY[algo.name].maskless and not algo.part_mask_input:
             raise UserError(f"algo={algo.name} is of one part, which the mask shows: leave algo.part_mask_input=true")
         needs_mask = algo.part_mask_input and not cfg.data.unmasked_share
@@ -237,9 +262,9 @@ def reference() -> str:
     lines = [
         "# Configuration",
         "",
-        "Every key of `launch/train.py`, `launch/evaluate.py` and `launch/view.py`, with its default before the files",
-        "in `conf/` set what differs; `python launch/train.py --help` shows the values that result. Written by",
-        "`python -m fb3d_rl.config`.",
+        "Every key of `launch/train.py`, `launch/evaluate.py`, `launch/view.py` and `launch/serve.py`, with its",
+        "default before the files in `conf/` set what differs; `python launch/train.py --help` shows the values that",
+        "result. Written by `python -m fb3d_rl.config`.",
     ]
     for title, rows in tables.items():
         lines += ["", f"## {title}", "", "| key | default | values | |", "| --- | --- | --- | --- |"]

@@ -36,6 +36,7 @@ class Entry:
     Attributes:
         access: the policy's inputs, by the ending of its name in tables.
         act: ``act(limits, flow policy's options)`` makes a policy that is not trained.
+        outside: whether ``act`` also takes ``target``, the name of the user's own code, and ``points`` of a cloud.
         algorithm: a :class:`fb3d_rl.algos.algorithm.Algorithm`, which trains it and loads its checkpoints.
         options: the dataclass of the keys of ``algo`` (:class:`fb3d_rl.algos.options.AlgoOptions`).
         opens_only: whether it can only open parts fully, so that it has no other goals.
@@ -48,6 +49,7 @@ class Entry:
     options: str = ""
     opens_only: bool = False
     joint_fit: bool = False
+    outside: bool = False
 
     @property
     def trained(self) -> bool:
@@ -63,6 +65,7 @@ class Entry:
 NOTHING = Access("nothing")
 WITHOUT_MASK = ", policy.mask=none"
 EXPERT = "the true flow of the part to open"
+DECLARED = "what of the truth its `in_keys` declare"
 IMITATION = Entry(
     {
         "": NOTHING,
@@ -103,6 +106,11 @@ REGISTRY = {
     "random": Entry(
         {"": Access("nothing, and it sees nothing", mask=False)}, act="fb3d_rl.policies.baselines:random_policy"
     ),
+    "plugin": Entry(
+        {"": NOTHING, WITHOUT_MASK: Access("nothing", mask=False), "_privileged": Access(DECLARED, truth=(FLOW,))},
+        act="fb3d_rl.policies.plugin:plugin_policy",
+        outside=True,
+    ),
     "bc": IMITATION,
     "dagger": IMITATION,
 }
@@ -120,8 +128,8 @@ def trained() -> tuple[str, ...]:
 
 
 def untrained() -> tuple[str, ...]:
-    """The policies that need no checkpoint."""
-    return tuple(name for name, entry in REGISTRY.items() if not entry.trained)
+    """The policies that need no checkpoint, by their names in tables."""
+    return tuple(name + ending for name, entry in REGISTRY.items() if not entry.trained for ending in entry.access)
 
 
 def truths() -> dict[str, Access]:

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> None:
     """Read and write."""
-    from fb3d_rl.algos.weights import load_network, weights_file
+    from fb3d_rl.algos.weights import NETWORK, load_network, named_network, weights_file
     from fb3d_rl.errors import UserError
     from fb3d_rl.models.export import export
     from fb3d_rl.training.checkpoint import load_checkpoint
@@ -53,6 +53,9 @@ def run(options: argparse.Namespace) -> None:
         if weights.suffix == ".pt":
             content = load_checkpoint(weights)
             about = {key: json.dumps(content[key]) for key in ("config", "seed", "step", "git_revision")}
+            about |= {} if (own := content["config"].get("algo", {}).get(NETWORK)) is None else {NETWORK: own}
+        elif (own := named_network(weights)) is not None:
+            about = {NETWORK: own}
         net.save_pretrained(options.out, about)
     print(f"wrote {options.out}: {options.out.stat().st_size / 2**20:.1f} MiB")
 

@@ -97,16 +97,14 @@ def run(words: Sequence[str]) -> int:
 
 def _one(cloud: Path, beside: Path, net: Any, checkpoint: str, settings: dict[str, Any]) -> str:
     """Plan for one cloud and write its files; returns what the terminal says."""
-    import numpy as np
-
     from fb3d_rl import plan, read_cloud
     from fb3d_rl.perception.files import in_box
     from fb3d_rl.predict import results
-    from fb3d_rl.predict.setting import moved
+    from fb3d_rl.predict.setting import seen_from
     from fb3d_rl.report.plan_page import sentence, write_page
 
     reading = {key: settings[key] for key in ("scale", "intrinsics", "depth_scale") if key in settings}
-    planning = {
+    planning: dict[str, Any] = {
         key: settings[key]
         for key in ("up", "front", "tilt", "ground", "foreground", "far", "tool_pose")
         if key in settings
@@ -114,12 +112,8 @@ def _one(cloud: Path, beside: Path, net: Any, checkpoint: str, settings: dict[st
     mask, pose = settings.get("mask"), settings.get("camera")
     box = mask if mask is not None and mask.startswith("box:") else None
     file = read_cloud(cloud, None if box else mask, **reading)
-    points, camera = file.points, file.camera if pose is None else pose
-    if file.optical and pose is not None and np.shape(pose) == (4, 4):
-        points = moved(points, pose)
-    elif file.optical:
-        camera = file.camera
-        planning = {"up": "-y", "tilt": 70.0, **planning}
+    points, camera, assumed = seen_from(file.points, file.camera if pose is None else pose, file.optical)
+    planning = assumed | planning
     marked = file.mask if box is None else in_box(points, box)
     found = plan(points, marked, camera, model=net, **planning)
     beside.parent.mkdir(parents=True, exist_ok=True)

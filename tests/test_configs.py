@@ -51,6 +51,8 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "experiment/comparison_partnet"): ["assets.root=."],
     ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
     ("train", "experiment/partnet_long"): ["assets.root=."],
+    **{("serve", f"assets/{name}"): ["assets.root=."] for name in ("partnet_mobility", "files", "mixed")},
+    **{(command, "policy/plugin"): ["policy.target=mine:make"] for command in ("evaluate", "serve")},
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/flowbotpp"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
@@ -82,7 +84,7 @@ def groups_of(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    further = ("random", "normal", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
+    further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
     other |= {("view", f"policy/{name}") for name in further}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.algos.learners import acting_policy
@@ -45,11 +48,27 @@ def learned(flow: str, oracle: bool) -> TensorDictModuleBase:
     return acting_policy(expert_policy(LIMITS), learner, oracle)
 
 
+def blind(limits: VelocityLimits, options: FlowPolicyOptions) -> Callable[[TensorDictBase], torch.Tensor]:
+    """A policy of a user's that declares nothing."""
+    return lambda seen: torch.zeros(*seen.batch_size, 8)
+
+
+def from_outside(make: Callable[..., object], options: FlowPolicyOptions) -> TensorDictModuleBase:
+    """policy=plugin with a function of this module."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "plugged", SimpleNamespace(make=make))  # type: ignore[arg-type]
+        made: TensorDictModuleBase = behind(REGISTRY["plugin"].act)(LIMITS, options, "plugged:make", 64)
+    return made
+
+
 POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
+    "plugin": lambda: from_outside(blind, MASKED),
+    "plugin, policy.mask=none": lambda: from_outside(blind, MASKLESS),
+    "plugin_privileged": lambda: from_outside(expert_policy, MASKED),
     **{
         name + ending: partial(untrained, name, MASKLESS if ending == WITHOUT_MASK else MASKED)
         for name, entry in REGISTRY.items()
-        if not entry.trained
+        if not entry.trained and not entry.outside
         for ending in entry.access
     },
     "artflownet": lambda: trained("artflownet", MASKED),

@@ -6,7 +6,7 @@ Each algorithm is a :class:`FlowNetwork` in the module of its name, which holds 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from torchrl.data import TensorDictReplayBuffer, TensorStorage
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.aggregation import rollout_samples
 from fb3d_rl.algos.algorithm import Acting
-from fb3d_rl.algos.weights import BEST, CHECKPOINT, best_cosine, load_network, load_trained, state_before
+from fb3d_rl.algos.weights import BEST, CHECKPOINT, NETWORK, best_cosine, load_network, load_trained, state_before
 from fb3d_rl.assets.catalog import Entry
 from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
 from fb3d_rl.data.options import SampleOptions
@@ -32,7 +32,9 @@ from fb3d_rl.flow.metrics import flow_metrics, mean_metrics
 from fb3d_rl.kinematics.opening import openable_links
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.models.plugin import own_network, require_flow
 from fb3d_rl.options import content, taken
+from fb3d_rl.plugins import said
 from fb3d_rl.policies.flow_policy import artflownet_policy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.options import FlowPolicyOptions
@@ -79,6 +81,7 @@ class FlowNetwork:
         objective: the loss to minimize; None for that of the flow.
         measure: computes the metrics of validation.
         flow: whether the network predicts the flow of a whole cloud.
+        target: name of the user's own class that stands in for ``network`` (algo.network).
     """
 
     network: type[CloudNetwork]
@@ -86,13 +89,16 @@ class FlowNetwork:
     objective: Callable[[nn.Module, FitOptions], Objective] | None = None
     measure: Measure = flow_numbers
     flow: bool = True
+    target: str | None = None
 
     def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
         """See :class:`~fb3d_rl.algos.algorithm.Algorithm`; only the first process returns rows."""
+        target = cast("FlowNetworkOptions", cfg.algo).network
+        kind = self if target is None else replace(self, network=own_network(target), target=target)
         if rank_and_count()[0]:
-            assist(self, cfg, out)
+            assist(kind, cfg, out)
             return []
-        return run(self, cfg, out)
+        return run(kind, cfg, out)
 
     def load(self, path: str | Path) -> Acting:
         """See :class:`~fb3d_rl.algos.algorithm.Algorithm`."""
@@ -101,7 +107,7 @@ class FlowNetwork:
     def acting(self, net: CloudNetwork) -> Acting:
         """The policy of a network."""
         policy = partial(self.policy, net)
-        return Acting(self.network.NAME, policy, net.part_mask_input, net if self.flow else None)
+        return Acting(net.NAME, policy, net.part_mask_input, net if self.flow else None)
 
 
 def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
@@ -141,9 +147,10 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
     if resume is None:
         (out / BEST).unlink(missing_ok=True)
+    about = {} if kind.target is None else {NETWORK: kind.target}
     with RunLog(out, resume_step=resume["step"] if resume else None, logger=logger) as run_log:
         fit(net, buffer, options, objective=kind.objective and kind.objective(net, options), device=device,
-            evaluate=partial(validate, kind, validation, device, out / BEST, fit_seed(cfg)), log=run_log.write,
+            evaluate=partial(validate, kind, validation, device, out / BEST, fit_seed(cfg), about), log=run_log.write,
             on_checkpoint=checkpoint, resume=resume["state"] if resume else None)  # fmt: skip
 
     policies: dict[str, Any] = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
@@ -153,19 +160,25 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
 
 
 def validate(
-    kind: FlowNetwork, samples: TensorDictBase | None, device: torch.device, best: Path, seed: int, measured: nn.Module
+    kind: FlowNetwork,
+    samples: TensorDictBase | None,
+    device: torch.device,
+    best: Path,
+    seed: int,
+    about: Mapping[str, str],
+    measured: nn.Module,
 ) -> dict[str, float]:
     """Metrics of a network on the validation objects; the file ``best`` keeps the weights with the largest cosine.
 
-    The objects of the final evaluation are not used here.
+    The file also holds ``about``. The objects of the final evaluation are not used here.
     """
     if samples is None:
         return {}
     net = cast(CloudNetwork, measured)
     numbers = {f"val/{key}": value for key, value in mean_metrics(kind.measure(net, samples, device)).items()}
     if numbers["val/cosine"] > best_cosine(best):
-        about = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(seed), "git_revision": git_revision()}
-        net.save_pretrained(best, about)
+        facts = {"val/cosine": repr(numbers["val/cosine"]), "seed": str(seed), "git_revision": git_revision()}
+        net.save_pretrained(best, facts | dict(about))
     return numbers
 
 
@@ -278,14 +291,24 @@ def new_network(kind: FlowNetwork, cfg: TrainConfig) -> CloudNetwork:
     """
     algo = cast("FlowNetworkOptions", cfg.algo)
     generator = torch.Generator().manual_seed(fit_seed(cfg))
-    if algo.hypotheses > 1 and kind.network is not ArtFlowNet:
+    of_its_kind = issubclass(kind.network, ArtFlowNet)
+    if algo.hypotheses > 1 and not of_its_kind:
         raise UserError(f"algo={algo.name} proposes one answer: leave algo.hypotheses=1")
     further: dict[str, Any] = {}
-    if kind.network is ArtFlowNet:
+    if of_its_kind:
         further = {"hypotheses": algo.hypotheses, "mask_optional": cfg.data.unmasked_share > 0}
-    net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator, **further)
+    try:
+        net = kind.network(algo.part_mask_input, algo.neighbors, algo.backbone, generator, **further)
+    except Exception as error:
+        if kind.target is None:
+            raise
+        raise UserError(f"algo.network={kind.target} cannot be made: {said(error)}") from error
+    if kind.target is not None:
+        require_flow(net, kind.target)
     if algo.start_from:
-        begun = load_trained(algo.start_from, kind.network)
+        begun = load_trained(algo.start_from, kind.network if kind.target is None else ArtFlowNet)
+        if type(begun) is not kind.network:
+            raise UserError(f"algo.start_from={algo.start_from} is a {type(begun).__name__}: leave it out")
         different = [
             f"algo.{key}={value}"
             for key, value in begun.arguments.items()

@@ -38,6 +38,9 @@ class FlowNetworkOptions(FlowFitOptions, AlgoOptions):
     backbone: Literal["pointnet2", "delayed"] = option(
         "pointnet2", "the paper's network, or one that is several times as fast"
     )
+    network: str | None = option(
+        None, "of algo=artflownet: package.module:Class, a CloudNetwork of your own in place of ArtFlowNet"
+    )
     neighbors: int = option(64, "largest number of points in a ball of PointNet++", within="[1, inf)")
     part_mask_input: bool = option(True, "whether the mask of the part to open is an input of the network")
     hypotheses: int = option(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ from fb3d_rl.algos import setup
 from fb3d_rl.algos.algorithm import Acting
 from fb3d_rl.evaluation.evaluate import evaluate
 from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.plugin import Plugin
 from fb3d_rl.registry import REGISTRY, behind
 from fb3d_rl.rollout.rows import TrialRow
 
@@ -22,13 +24,21 @@ def run_training(cfg: TrainConfig, out: Path) -> list[TrialRow]:
     return rows
 
 
-def acting(name: str, checkpoint: str | None) -> Acting:
+def acting(name: str, checkpoint: str | None, target: str | None = None, points: int = 1200) -> Acting:
     """The policy of that name; a trained one is loaded from its checkpoint.
+
+    Args:
+        name: of the registry.
+        checkpoint: of one that is trained.
+        target: of one from outside, see :mod:`fb3d_rl.policies.plugin` ...
+        points: ... which is tried with a cloud of so many.
 
     Raises:
         UserError: the checkpoint is missing or of another algorithm.
     """
     entry = REGISTRY[name]
+    if entry.outside:
+        return Acting(name, partial(behind(entry.act), target=target, points=points))
     if not entry.trained:
         return Acting(name, behind(entry.act))
     loaded: Acting = behind(entry.algorithm).load(checkpoint)
@@ -42,11 +52,18 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
         One row for each scheduled trial and policy.
     """
     setup.choose_device(cfg.device)  # a missing device is an error before anything is read
-    chosen = acting(cfg.policy.name, cfg.checkpoint)
+    chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)
     protocol = setup.protocol(cfg, cfg.resume)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     policies = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
-    policies[chosen.name] = chosen.policy(limits, speeds)
+    made, facts = chosen.policy(limits, speeds), setup.facts(cfg)
+    name = chosen.name
+    if isinstance(made, Plugin):
+        facts["policy_target"] = made.target
+        if made.truths:
+            name += "_privileged"
+            facts["privileged_inputs"] = made.truths
+    policies[name] = made
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
-    return evaluate(out, objects, policies, protocol, setup.facts(cfg), chosen.network)
+    return evaluate(out, objects, policies, protocol, facts, chosen.network)

@@ -60,11 +60,20 @@ def read_intrinsics(path: Path) -> Intrinsics:
         content = yaml.safe_load(text.replace("\t", " "))  # JSON is YAML
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
         raise UserError(f"{path} is neither JSON nor YAML: {' '.join(str(error).split())}.") from error
+    return intrinsics_in(content, str(path))
+
+
+def intrinsics_in(content: Any, name: str) -> Intrinsics:
+    """The intrinsics in what a file or a message holds, see :func:`read_intrinsics`.
+
+    Raises:
+        UserError: it holds none; ``name`` is what it is called.
+    """
     try:
         return _intrinsics(_flat(content))
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         names = "fx, fy, cx and cy, or a 3 x 3 matrix such as K"
-        raise UserError(f"{path} does not tell a camera's intrinsics: give {names}.") from error
+        raise UserError(f"{name} does not tell a camera's intrinsics: give {names}.") from error
 
 
 def _flat(content: Any, deep: int = 0) -> dict[str, Any]:

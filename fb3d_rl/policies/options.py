@@ -246,6 +246,7 @@ class PolicyOptions:
     """Which policy is evaluated (``policy=NAME``), and how all that follow a flow choose a contact point and move."""
 
     name: str = option("expert", "a name of conf/policy/")
+    target: str | None = option(None, "of policy=plugin: package.module:make, your own policy")
     mask: Literal["target", "none"] | None = option(
         None,
         "which points the policy acts on: those of the part to open, or none, whatever has a flow (the "

@@ -143,7 +143,7 @@ def plan(
     part = None if marked is None else marked[kept]
     if part is not None and not bool((part & inside).any()):
         raise UserError("The mask marks no point of the object: they are missing, on its support or too far away.")
-    world, scale = torch.from_numpy(scene.points).float(), _enlarging(scene.points[scene.inside])
+    world, scale = torch.from_numpy(scene.points).float(), enlarging(scene.points[scene.inside])
     if scale != 1:
         remarks.append(f"the network saw the object {scale:.2f} times as large, of the size that it knows")
     if part is None and needs_mask(net):
@@ -255,7 +255,7 @@ def _grasp(
     )
 
 
-def _enlarging(points: Array) -> float:
+def enlarging(points: Array) -> float:
     """By how much the network is to see the cloud [n, 3] enlarged."""
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
     return 1.0 if USUAL[0] <= diagonal <= USUAL[1] else SIZE / max(diagonal, 1e-6)

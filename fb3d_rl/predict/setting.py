@@ -140,6 +140,24 @@ def moved(points: NDArray[Any], pose: Array) -> Array:
     return np.asarray(points @ turn.T + pose[:3, 3])
 
 
+def seen_from(
+    points: NDArray[Any], camera: ArrayLike | None, optical: bool
+) -> tuple[NDArray[Any], ArrayLike | None, dict[str, Any]]:
+    """A cloud [N, 3] and its camera for :func:`fb3d_rl.predict.plan.plan`, and what that has to assume.
+
+    Points in the frame of their own camera (``optical``) are moved to the world if ``camera`` is a pose T_world_camera
+    [4, 4]; else that frame stays, in which up is about -y.
+
+    Raises:
+        UserError: the pose is no rigid one.
+    """
+    if not optical:
+        return points, camera, {}
+    if camera is not None and np.shape(camera) == (4, 4):
+        return moved(points, np.asarray(camera, dtype=np.float64)), camera, {}
+    return points, np.zeros(3), {"up": "-y", "tilt": 70.0}
+
+
 def position(camera: ArrayLike) -> Array:
     """Where a camera stands, of its position [3] or its pose [4, 4]."""
     try:
@@ -174,9 +192,9 @@ def numbers(values: ArrayLike, shape: Sequence[int], name: str) -> Tensor:
         UserError: they are none; ``name`` is what they are called.
     """
     try:
-        numbers = torch.as_tensor(np.asarray(values, dtype=np.float64))
+        numbers = torch.tensor(np.asarray(values, dtype=np.float64))
     except (ValueError, TypeError) as error:
         raise UserError(f"{name} is no list of {shape[0]} numbers.") from error
     if tuple(numbers.shape) != tuple(shape) or not bool(numbers.isfinite().all()):
-        raise UserError(f"{name} is {list(numbers.shape)}: give {shape[0]} numbers.")
+        raise UserError(f"{name} is {list(numbers.shape)}: give {shape[0]} finite numbers.")
     return numbers

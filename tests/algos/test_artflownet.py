@@ -155,6 +155,7 @@ def test_a_device_that_is_not_there_is_refused_by_every_command(
     commands += [(run_evaluation, "evaluate", f"policy={name}") for name in REGISTRY]
     for command, name, choice in commands:
         given = ["checkpoint=nowhere.pt"] if name == "evaluate" else []
+        given += ["policy.target=mine:make"] if choice == "policy=plugin" else []
         with pytest.raises(UserError, match="device=cuda, but torch finds no CUDA device"):
             command(config(name, ["experiment=smoke", "device=cuda", choice, *given]), tmp_path / "out")
     assert not (tmp_path / "out").exists()

@@ -37,6 +37,7 @@ COMMANDS = {
     "train": ["train.py", "experiment=smoke"],
     "evaluate": ["evaluate.py", "collector.workers=2"],
     "view": ["view.py", "port=18090"],
+    "serve": ["serve.py", "port=0"],
     "validate": ["objects.py", "validate", "ROOT", "--workers", "2", "--out", "validation.json"],
     "list": ["objects.py", "list", "ROOT"],
     "preview": ["objects.py", "preview", "ROOT", "--out", "sheet.png"],

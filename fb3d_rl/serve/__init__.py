@@ -1,0 +1,1 @@
+"""A policy server for robots: messages (``protocol``), one client's episode (``episode``), the socket (``server``)."""
