@@ -93,7 +93,7 @@ class OpenArticulatedEnv(StagedEnv):
         self.options = EnvOptions.of(options) if isinstance(options, Mapping) else options or EnvOptions()
         self.use(find_objects(objects, split), link)
         self.stages = []
-        self.metadata = {**self.metadata, "render_fps": self.options.control_freq}
+        self.metadata = {**StagedEnv.metadata, "render_fps": self.options.control_freq}
         for name in ("obs_mode", "reward_mode", "render_mode"):
             require_mode(name, kwargs.get(name), getattr(self, f"SUPPORTED_{name.upper()}S"))
         kwargs["sim_backend"] = choose_simulator(kwargs.get("sim_backend", "auto"), num_envs)
