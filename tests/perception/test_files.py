@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -355,3 +356,10 @@ def test_changed_bytes_never_crash(tmp_path: Path) -> None:
 @pytest.mark.timeout(200)
 def test_many_more_changed_bytes_never_crash(tmp_path: Path) -> None:
     assert _fuzz(tmp_path, range(300, 2300), read_cloud) > 100
+
+
+def test_a_recording_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0")
+    with pytest.raises(UserError, match=r'a\.bag is a recording of ROS, which needs rosbags: pip install "fb3d_rl'):
+        read_cloud(tmp_path / "a.bag")
