@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.arrays import as_mask, as_points, near_origin
+from fb3d_rl.perception.arrays import as_mask, as_points, near_origin, places
 from fb3d_rl.perception.bags import BAGS, is_bag, read_bag
 from fb3d_rl.perception.depth import points_of, read_depth, read_intrinsics
 from fb3d_rl.perception.records import Fields, read_pcd, read_ply
@@ -124,11 +124,12 @@ def read_cloud(
         raise UserError(f"{file} holds no points.")
     cleaned, _ = near_origin_of(file, points)
     measured = cleaned.isfinite().all(1) & (points != 0).any(1)
-    rows = measured.nonzero().flatten().numpy()
+    rows = places(measured).numpy()
     if len(rows) < 3:
         raise UserError(f"{file} holds {len(rows)} measured points: all others are zero or not finite.")
-    cloud, remarks = points.numpy()[rows], [raw.remark] if raw.remark else []
-    if len(rows) < len(points):
+    everything = len(rows) == len(points)
+    cloud, remarks = points.numpy() if everything else points.numpy()[rows], [raw.remark] if raw.remark else []
+    if not everything:
         remarks.append(f"{len(points) - len(rows):,} of {len(points):,} points are missing (zero or not finite)")
     span = float(np.linalg.norm(np.subtract(*np.percentile(cloud[:: max(1, len(cloud) // 10_000)], (99, 1), axis=0))))
     if scale is None and span > MILLIMETRES:
