@@ -308,12 +308,15 @@ def test_a_picture_is_no_depth_and_intrinsics_have_to_fit(tmp_path: Path) -> Non
 
 def test_lzf() -> None:
     data = b"abc" * 100 + bytes(600) + b"x" * 5
-    assert unpack_lzf(pack_lzf(data), len(data)) == data
+    assert unpack_lzf(pack_lzf(data), len(data)).tobytes() == data
     overlapping = bytes([2]) + b"abc" + bytes([7 << 5, 20, 2])  # 29 bytes from three before
-    assert unpack_lzf(overlapping, 32) == (b"abc" * 11)[:32]
-    for broken, size in ((pack_lzf(data)[:-1], len(data)), (pack_lzf(data), 10), (bytes([255, 255, 255]), 9), (b"", 4)):
+    assert unpack_lzf(overlapping, 32).tobytes() == (b"abc" * 11)[:32]
+    assert not len(unpack_lzf(b"", 0))
+    packed = pack_lzf(data)
+    broken = [(packed[:-1], len(data)), (packed, 10), (packed, len(data) - 1), (packed, len(data) + 1)]
+    for wrong, size in (*broken, (bytes([255, 255, 255]), 9), (b"", 4), (packed, 2**32 - 1)):
         with pytest.raises(UserError):
-            unpack_lzf(broken, size)
+            unpack_lzf(wrong, size)
 
 
 def _fuzz(tmp_path: Path, seeds: range, read: Callable[[Path], Any]) -> int:
