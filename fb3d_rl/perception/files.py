@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -43,6 +45,12 @@ DEPTH_PER_METRE = 1000.0
 
 MILLIMETRES = 50.0
 """A cloud that spans more is one in millimetres: 50 m seen at once, or 5 cm."""
+
+DAMAGE = (
+    ValueError, LookupError, TypeError, OverflowError, EOFError, SyntaxError, OSError, RuntimeError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What Python, NumPy and Pillow raise on a damaged file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +164,7 @@ def _read(file: Path, reader: Callable[[Path], _Raw]) -> _Raw:
         return reader(file)
     except UserError as error:
         raise UserError(f"{file} {error}.") from error
-    except (ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         why = " ".join(str(error).split())[:120]
         raise UserError(f"{file} is damaged or no {file.suffix.lower()} file ({why}): export it anew.") from error
     except MemoryError as error:
@@ -334,5 +342,5 @@ def _mask_file(file: Path) -> NDArray[Any]:
                     content = np.empty(0) if name is None else content[name]
                 return np.asarray(content).reshape(-1)
         return np.loadtxt(file, ndmin=1, delimiter="," if "," in file.read_text("latin-1")[:1000] else None).reshape(-1)
-    except (ValueError, KeyError, IndexError, EOFError, OSError, SyntaxError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise UserError(f"{file} is damaged or no mask ({' '.join(str(error).split())[:120]}).") from error
