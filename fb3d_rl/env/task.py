@@ -90,7 +90,8 @@ class OpenArticulatedEnv(StagedEnv):
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:
-        self.options = EnvOptions.of(options) if isinstance(options, Mapping) else options or EnvOptions()
+        options = EnvOptions.of(options) if isinstance(options, Mapping) else options
+        self.options: EnvOptions = options or EnvOptions()
         self.use(find_objects(objects, split), link)
         self.stages = []
         self.metadata = {**StagedEnv.metadata, "render_fps": self.options.control_freq}
