@@ -1,7 +1,7 @@
 """Make procedural objects; import, unpack, list, validate, preview and compare objects.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
-python launch/objects.py import PATH... --out DIR [--category NAME] [--package DIR] [--scale .001] [--up y] [--front=+y]
+python launch/objects.py import PATH... --out DIR [--category NAME] [--package DIR] [--scale mm] [--up y] [--front -y]
 python launch/objects.py unpack ARCHIVE --out DIR
 python launch/objects.py list PATH [--split SPLIT]
 python launch/objects.py validate PATH [--out FILE.json] [--workers N]
@@ -21,18 +21,33 @@ if __name__ == "__main__":
 import argparse
 import json
 import os
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+SIDES = ("auto", "-x", "+x", "-y", "+y")
+"""What ``--front`` takes."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code (1: validate found an object that is broken; 2: a mistake)."""
-    options = _parser().parse_args(arguments)
+    options = _parser().parse_args(joined(sys.argv[1:] if arguments is None else arguments))
     # Imported late: --help answers at once.
     from fb3d_rl.errors import exit_code
 
     return exit_code(lambda: COMMANDS[options.command](options), interrupted="objects that were finished are kept")
+
+
+def joined(words: Sequence[str]) -> list[str]:
+    """The words with "--front -x" as "--front=-x": argparse would take the side for an option."""
+    found: list[str] = []
+    for word in words:
+        if found and found[-1] == "--front" and word in SIDES:
+            found[-1] += f"={word}"
+        else:
+            found.append(word)
+    return found
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -64,14 +79,16 @@ def _parser() -> argparse.ArgumentParser:
         "--package", action="append", default=[], metavar="DIR", help="a folder that package://NAME/ means"
     )
     take.add_argument(
-        "--scale", default="auto", help="metres in a unit of the files; auto recognises millimetres (default)"
+        "--scale",
+        default="auto",
+        help="the files' unit, m, mm, cm, inch or the metres in one; auto recognises it by the objects' size (default)",
     )
     take.add_argument("--up", default="z", choices=("z", "y"), help="which axis points up (default: z)")
     take.add_argument(
         "--front",
         default="auto",
-        choices=("auto", "-x", "+x", "-y", "+y"),
-        help="--front=-x: where the front faces once z is up (default: auto, where the parts open to)",
+        choices=SIDES,
+        help="where the front faces once z is up (default: auto, where the parts open to)",
     )
 
     says = "unpack a .zip or .tar archive of objects; nothing in it can leave DIR"

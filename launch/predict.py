@@ -2,7 +2,8 @@
 
 python launch/predict.py CLOUD... [checkpoint=pretrained] [out=OUT] [mask=...] [camera=...] [KEY=VALUE ...]
 
-CLOUD: .ply .pcd .npy .npz .xyz .txt .csv, or a 16-bit .png of depth with the intrinsics of its camera beside it.
+CLOUD: .ply .pcd .npy .npz .xyz .txt .csv, a 16-bit .png of depth with the intrinsics of its camera beside it, or a
+recording of ROS: .bag .db3 .mcap or a folder.
 For each CLOUD it writes into the folder OUT: NAME.flow.ply and NAME.npz (the flow), NAME.json (the plan: contact point,
 pull, pre-contact point, orientation of the gripper, each hypothesis with its probability) and NAME.html (a page with
 arrows that opens offline; a click on its points writes the mask= to give).
@@ -37,9 +38,14 @@ KEYS = {
     "scale": "metres in a unit of the file (default: 1, or .001 for a cloud that spans more than 50)",
     "intrinsics": "of a depth image, .json or .yaml (default: NAME.json, NAME.yaml, intrinsics.json ... beside it)",
     "depth_scale": "units of a depth image in a metre (default: what the intrinsics say, else 1000)",
+    "topic": "of a recording, the one with the clouds (default: the only one)",
+    "message": "of a recording, the place of the cloud among those of its topic, from 0 on (default: 0)",
     "tool_pose": "the suction tip now, X,Y,Z,QW,QX,QY,QZ in the cloud's frame (default: unknown)",
 }
 """The settings, given as KEY=VALUE."""
+
+READING = ("scale", "intrinsics", "depth_scale", "topic", "message")
+"""Those of them that say how a file is read."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -103,7 +109,7 @@ def _one(cloud: Path, beside: Path, net: Any, checkpoint: str, settings: dict[st
     from fb3d_rl.predict.setting import seen_from
     from fb3d_rl.report.plan_page import sentence, write_page
 
-    reading = {key: settings[key] for key in ("scale", "intrinsics", "depth_scale") if key in settings}
+    reading = {key: settings[key] for key in READING if key in settings}
     planning: dict[str, Any] = {
         key: settings[key]
         for key in ("up", "front", "tilt", "ground", "foreground", "far", "tool_pose")
@@ -142,6 +148,10 @@ def _settings(given: dict[str, str]) -> dict[str, Any]:
     for key in ("far", "scale", "depth_scale"):
         if key in given and not values[key] > 0:
             raise UserError(f"{key}={given[key]} is out of range; give more than 0")
+    if "message" in given:
+        if not given["message"].isdecimal():
+            raise UserError(f"message={given['message']}: give a whole number, 0 for the first")
+        values["message"] = int(given["message"])
     for key in ("up", "front"):
         if "," in given.get(key, ""):
             values[key] = _numbers(key, given[key], 3)

@@ -9,6 +9,9 @@ from typing import Any, Literal
 from fb3d_rl.errors import UserError
 from fb3d_rl.options import option
 
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "inch": 0.0254}
+"""Metres in each unit of length that a file may be in."""
+
 
 @dataclass(frozen=True)
 class AssetsOptions:
@@ -53,7 +56,8 @@ class AssetsOptions:
     )
     packages: list[str] = option([], "files: folders that package://NAME/... may mean, besides the object's own")
     scale: Any = option(
-        "auto", "files: metres in one of their units; auto takes what is larger than 20 m as millimetres"
+        "auto",
+        "files: their unit, m, mm, cm, inch or the metres in one; auto recognises what is larger than 20 m by its size",
     )
     up: Literal["z", "y"] = option("z", "files: which axis points up")
     front: Literal["auto", "-x", "+x", "-y", "+y"] = option(
@@ -73,16 +77,17 @@ class AssetsOptions:
         """``scale``, checked.
 
         Raises:
-            UserError: it is neither auto nor a positive number.
+            UserError: it is neither auto nor a unit nor a positive number.
         """
         try:
-            factor = math.nan if self.scale == "auto" else float(self.scale)
+            factor = math.nan if self.scale == "auto" else float(UNITS.get(self.scale, self.scale))
         except (TypeError, ValueError):
             factor = 0.0
         if math.isnan(factor) and self.scale == "auto":
             return "auto"
         if not 0.0 < factor < math.inf:
             raise UserError(
-                f"assets.scale={self.scale} is no scale; give auto or the metres in a unit of the files, such as 0.001"
+                f"assets.scale={self.scale} is no scale; give auto, {', '.join(UNITS)} or the metres in a unit of the "
+                "files, such as 0.001"
             )
         return factor

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,6 +87,25 @@ class EnvOptions:
     # Parts are hollow, but their hulls are solid and overlap: at the density of wood a wide drawer would weigh 600 kg.
     density: float = option(100.0, "of the convex hulls of the object's parts; furniture is hollow", "kg/m^3")
 
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> EnvOptions:
+        """The inverse of ``dataclasses.asdict``, also once that has been through JSON; what is left out is the default.
+
+        Raises:
+            UserError: there is no such option.
+        """
+        kinds: dict[str, Any] = {
+            "gripper": GripperOptions, "suction": SuctionOptions, "camera": CameraOptions, "views": ViewRange,
+        }  # fmt: skip
+        try:
+            given = {name: kinds[name](**value) if name in kinds else value for name, value in values.items()}
+            if "views" in given:
+                ranges = {name: tuple(ends) for name, ends in asdict(given["views"]).items()}
+                given["views"] = ViewRange(**ranges)
+            return cls(**given)
+        except TypeError as error:
+            raise UserError(f"the task's options {dict(values)} are none of this version ({error})") from error
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -106,6 +126,20 @@ class Trial:
     view: View
     seed: int = 0
     goal: float | None = None
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Trial:
+        """The inverse of ``dataclasses.asdict``, also once that has been through JSON.
+
+        Raises:
+            UserError: it is no trial.
+        """
+        try:
+            return cls(**{**values, "start": tuple(values["start"]), "view": View(**values["view"])})
+        except (TypeError, KeyError) as error:
+            raise UserError(
+                f"{dict(values)} is no trial; give object, link, start, and view with azimuth and elevation"
+            ) from error
 
     def cloud_rng(self, step: int = 0) -> np.random.Generator:
         """The generator of the cloud after ``step`` control steps; a restored state sees the same cloud."""

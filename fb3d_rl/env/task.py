@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ class OpenArticulatedEnv(StagedEnv):
     Args:
         objects: objects, or the path of one or of many (PartNet-Mobility folders, URDF files); a few procedural
             objects unless given.
-        options: the task's constants.
+        options: the task's constants, also as nested dicts of those that differ from the default.
         split: of a folder of many objects, those of this split, category or id (a name or a list).
         link: name of the link to open; any unless given.
         num_envs: environments that run side by side; more than one need CUDA.
@@ -84,16 +84,17 @@ class OpenArticulatedEnv(StagedEnv):
     def __init__(
         self,
         objects: Iterable[ArticulatedObject] | str | Path | None = None,
-        options: EnvOptions | None = None,
+        options: EnvOptions | Mapping[str, Any] | None = None,
         split: str | int | Sequence[object] = "all",
         link: str | None = None,
         num_envs: int = 1,
         **kwargs: Any,
     ) -> None:
-        self.options = options or EnvOptions()
+        options = EnvOptions.of(options) if isinstance(options, Mapping) else options
+        self.options: EnvOptions = options or EnvOptions()
         self.use(find_objects(objects, split), link)
         self.stages = []
-        self._trial_rng = np.random.default_rng(0)
+        self.metadata = {**StagedEnv.metadata, "render_fps": self.options.control_freq}
         for name in ("obs_mode", "reward_mode", "render_mode"):
             require_mode(name, kwargs.get(name), getattr(self, f"SUPPORTED_{name.upper()}S"))
         kwargs["sim_backend"] = choose_simulator(kwargs.get("sim_backend", "auto"), num_envs)
@@ -138,8 +139,8 @@ class OpenArticulatedEnv(StagedEnv):
 
         Args:
             seed: of the trials that are drawn from here on.
-            options: ``{"trials": [Trial, ...]}`` with one trial for each environment that is reset; without it they
-                are drawn.
+            options: ``{"trials": [Trial, ...]}`` with one trial (or its ``dataclasses.asdict``, which RecordEpisode can
+                keep) for each environment that is reset; without it they are drawn.
 
         Raises:
             UserError: a trial names an object or a part that does not exist or cannot be opened, or only some
@@ -149,13 +150,15 @@ class OpenArticulatedEnv(StagedEnv):
         if isinstance(seed, list) and len(seed) == 1:
             [seed] = seed
         if seed is not None:
-            self._trial_rng = np.random.default_rng(seed)
+            self._np_random, self._np_random_seed = np.random.default_rng(seed), seed  # gymnasium's, as of its Env
         which = sorted(int(i) for i in options.get("env_idx", range(self.num_envs)))
         full = len(which) == self.num_envs
         trials = options.pop("trials", None)
+        if trials is not None:
+            trials = [Trial.of(trial) if isinstance(trial, Mapping) else trial for trial in trials]
         seeds: list[int] | None = None if trials is None or not full else [trial.seed for trial in trials]
         if trials is None:
-            rng = self._trial_rng
+            rng = self.np_random
             if full:  # a seed of its own, which RecordEpisode keeps, so that the episode can be replayed
                 drawn = int(rng.integers(2**31)) if seed is None else seed
                 rng, seeds = np.random.default_rng(drawn), drawn if isinstance(drawn, list) else [drawn]
@@ -330,22 +333,26 @@ def _rows_of(state: Mapping[str, Any], device: torch.device) -> dict[str, Any]:
     }
 
 
-def take_time_limit(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
-    """The task with the horizon that ``gymnasium.make(max_episode_steps=N)`` names, without the wrapper that it makes.
+def as_made(env: gymnasium.Env[Any, Any]) -> gymnasium.Env[Any, Any]:
+    """What ``gymnasium.make`` gives: a task whose spec holds plain options, and without the wrapper of a time limit.
 
-    The wrapper has one count for all environments, and its ``truncated`` is no tensor, as ManiSkill's vector
-    environment asks for.
+    RecordEpisode writes the spec as JSON. ``gymnasium.make(max_episode_steps=N)`` names the horizon: the wrapper that
+    it makes has one count for all environments, and its ``truncated`` is no tensor, as ManiSkill's vector environment
+    asks for.
     """
+    task = env.unwrapped
+    assert isinstance(task, OpenArticulatedEnv) and task.spec is not None
+    if isinstance(task.spec.kwargs.get("options"), EnvOptions):
+        task.spec.kwargs = task.spec.kwargs | {"options": asdict(task.options)}
     if not isinstance(env, TimeLimit):
         return env
-    task, steps = env.unwrapped, int(env._max_episode_steps)
-    assert isinstance(task, OpenArticulatedEnv) and task.spec is not None
+    steps = int(env._max_episode_steps)
     task.options = replace(task.options, horizon=steps)
-    task.spec.max_episode_steps, task.spec.additional_wrappers = steps, (_LIMIT,)  # so that the spec makes it again
+    task.spec.max_episode_steps, task.spec.additional_wrappers = steps, (_AS_MADE,)  # so that the spec makes it again
     return env.env
 
 
 # ManiSkill's own decorator would wrap the task in a time limit that overrides ``truncated``.
 register(TASK, OpenArticulatedEnv)
-_LIMIT = WrapperSpec("TimeLimit", f"{__name__}:take_time_limit", {})
-gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True, additional_wrappers=(_LIMIT,))
+_AS_MADE = WrapperSpec("AsMade", f"{__name__}:as_made", {})
+gymnasium.register(TASK, entry_point=OpenArticulatedEnv, disable_env_checker=True, additional_wrappers=(_AS_MADE,))

@@ -38,8 +38,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import betaincinv, stdtrit
-from scipy.stats import norm
+from scipy.special import betaincinv, ndtri, stdtrit
 
 LEVEL = 0.95
 _UPPER = (1 + LEVEL) / 2
@@ -54,7 +53,7 @@ def wilson(value: ArrayLike, n: float) -> tuple[NDArray[np.float64], NDArray[np.
 
     Written out because scipy's takes whole counts only, while an object's mean may be any fraction.
     """
-    mean, z = np.asarray(value, dtype=np.float64), float(norm.ppf(_UPPER))
+    mean, z = np.asarray(value, dtype=np.float64), float(ndtri(_UPPER))
     centre = (mean + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * np.sqrt(mean * (1 - mean) / n + z * z / (4 * n * n))
     # The limits at 0 and 1 are exact on paper; keep rounding from putting the value outside.

@@ -13,10 +13,20 @@ import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh, Mimic
+from fb3d_rl.assets.options import UNITS
 from fb3d_rl.kinematics.opening import LARGEST, link_corners, openable_links, opening_range, standing_bounds
 from fb3d_rl.kinematics.tree import KinematicTree
 
-MILLI = 1e-3
+UNIT_NAMES = {"m": "metres", "mm": "millimetres", "cm": "centimetres", "inch": "inches"}
+
+ACROSS = (0.2, 5.0)
+"""Furniture and appliances measure from so much to so much across, m."""
+
+BOARD = (0.01, 0.03)
+"""Their boards are from so much to so much thick, m."""
+
+FLAT = 0.2
+"""A board is thinner than this share of its width."""
 
 FITS = 2.0
 """A part does not slide farther than so many times the object's size."""
@@ -39,7 +49,7 @@ class Frame:
     """In which units and axes files are.
 
     Attributes:
-        scale: metres in one of the file's units; "auto" recognises millimetres.
+        scale: metres in one of the file's units; "auto" recognises them (:func:`unit_of`).
         up: the axis that points up.
         front: where the object's front faces once z is up; "auto" is where its parts open to.
     """
@@ -55,10 +65,11 @@ def in_metres(obj: ArticulatedObject, scale: float | Literal["auto"]) -> Articul
         return obj
     size, remarks, own = _size(obj), [], dict[str, float]()
     if scale == "auto":
-        scale = MILLI if size > LARGEST else 1.0
+        unit, said = unit_of(obj, size)
+        scale = UNITS[unit]
         own = _other_units(obj, size, scale)
-        if scale != 1.0:
-            remarks.append(f"lengths: the object measures {size:.4g} across, so they are taken as millimetres")
+        if said:
+            remarks.append(said)
         remarks += [
             f"limits of joint {name}: taken as {'metres' if factor == 1.0 else 'millimetres'}, as they fit the object"
             for name, factor in own.items()
@@ -66,8 +77,40 @@ def in_metres(obj: ArticulatedObject, scale: float | Literal["auto"]) -> Articul
     elif scale != 1.0:
         remarks.append(f"lengths: {scale:g} times those of the file")
     if scale == 1.0 and not own:
-        return obj
+        return replace(obj, dropped=(*obj.dropped, *remarks)) if remarks else obj
     return replace(scaled(obj, scale, own), dropped=(*obj.dropped, *remarks))
+
+
+def unit_of(obj: ArticulatedObject, size: float) -> tuple[str, str]:
+    """The unit of an object of this ``size`` across, a key of ``UNITS``, and what is to be said about it ("": nothing).
+
+    Up to 20 it is the metre. Above, it is the one in which the object would be as large as furniture and appliances
+    are: from 200 on millimetres, as CAD has them; below, centimetres, or inches where these alone make boards of it.
+    Another one that would fit is named.
+    """
+    fits = [name for name, unit in UNITS.items() if name != "m" and ACROSS[0] <= unit * size <= ACROSS[1]]
+    if size <= LARGEST:
+        unit, fits = "m", fits if size > ACROSS[1] else []
+    elif "mm" in fits or not fits:
+        unit = "mm"
+    else:
+        thick = _thickness(obj)
+        boards = [name for name in fits if BOARD[0] <= UNITS[name] * thick <= BOARD[1]]
+        unit = (boards or fits)[0]
+    others = [f"{UNIT_NAMES[name]} ({UNITS[name] * size:.2g} m): scale={name}" for name in fits if name != unit]
+    if unit == "m" and not others:
+        return unit, ""
+    said = f"lengths: the object measures {size:.4g} across, so they are taken as {UNIT_NAMES[unit]}"
+    if others:
+        said += f" ({UNITS[unit] * size:.2g} m), but may be {' or '.join(others)}"
+    return unit, said
+
+
+def _thickness(obj: ArticulatedObject) -> float:
+    """How thick the object's boards are: the middle one of its flat shapes; NaN if it has none."""
+    sides = [np.sort(np.ptp(mesh.vertices, axis=0)) for link in obj.links for mesh in link.visuals]
+    flat = [float(side[0]) for side in sides if side[0] < FLAT * side[1]]
+    return float(np.median(flat)) if flat else math.nan
 
 
 def _other_units(obj: ArticulatedObject, size: float, scale: float) -> dict[str, float]:
@@ -75,7 +118,7 @@ def _other_units(obj: ArticulatedObject, size: float, scale: float) -> dict[str,
     travels = {joint.name: joint.limits[1] - joint.limits[0] for joint in map(obj.joint_of, obj.movable)
                if joint.type == "prismatic"}  # fmt: skip
     if scale == 1.0:
-        return {name: MILLI for name, travel in travels.items() if travel > LARGEST and travel > FITS * size}
+        return {name: UNITS["mm"] for name, travel in travels.items() if travel > LARGEST and travel > FITS * size}
     return {name: 1.0 for name, travel in travels.items() if 0.0 < travel <= FITS * scale * size}
 
 

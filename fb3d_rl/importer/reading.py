@@ -15,11 +15,12 @@ import numpy as np
 
 from fb3d_rl.assets.articulation import ArticulatedObject, Link
 from fb3d_rl.assets.cache import Parsed
+from fb3d_rl.assets.options import UNITS
 from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT, load_object, named_errors
 from fb3d_rl.assets.urdf import UrdfReader
 from fb3d_rl.errors import UserError
 from fb3d_rl.importer.files import HEAD, Source
-from fb3d_rl.importer.frames import MILLI, Frame, in_metres, upright
+from fb3d_rl.importer.frames import UNIT_NAMES, Frame, in_metres, upright
 from fb3d_rl.kinematics.opening import CONTROLS, LARGEST, openable_links
 from fb3d_rl.kinematics.validation import Finding, Verdict, findings
 
@@ -28,6 +29,10 @@ NAMES = CONTROLS | frozenset("door drawer lid cover seat screen window sash flap
 
 MIXED = 100.0
 """Meshes so many times as large as the distances between joints are in other units than these."""
+
+MILLI = 500.0
+"""Meshes so many times as large are in millimetres, smaller ones in centimetres: links are as large as these distances
+or a few times as large."""
 
 
 class FileReader(UrdfReader):
@@ -68,8 +73,9 @@ def read_urdf(source: Source) -> Parsed:
     size, distance = _extents(links)
     if size <= LARGEST or not 0.0 < MIXED * distance < size:
         return links, dropped, lost
-    links, dropped, lost = FileReader(source, MILLI).read()
-    return links, (*dropped, "lengths: the meshes are taken as millimetres, the joints as metres"), lost
+    unit = "mm" if size > MILLI * distance else "cm"
+    links, dropped, lost = FileReader(source, UNITS[unit]).read()
+    return links, (*dropped, f"lengths: the meshes are taken as {UNIT_NAMES[unit]}, the joints as metres"), lost
 
 
 READERS: dict[bytes, Callable[[Source], Parsed]] = {b"robot": read_urdf}

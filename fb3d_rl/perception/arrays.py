@@ -122,13 +122,14 @@ def near_origin(cloud: Tensor) -> tuple[Tensor, Tensor]:
         cloud: [N, 3] of :func:`as_points`.
 
     Returns:
-        The cloud [N, 3] and the origin [3] in the cloud's precision, 0 unless it was moved.
+        The cloud [N, 3], which may share the memory of the given one, and the origin [3] in the cloud's precision, 0
+        unless it was moved.
 
     Raises:
         UserError: there are several points, and all are the same.
     """
     origin = cloud.new_zeros(3)
-    rows = cloud.isfinite().all(1).nonzero().flatten()
+    rows = places(cloud.isfinite().all(1))
     if not len(rows):
         return torch.full_like(cloud, torch.nan, dtype=torch.float32), origin
     sample = cloud[rows[:: max(1, len(rows) // _SAMPLE)]]
@@ -137,10 +138,19 @@ def near_origin(cloud: Tensor) -> tuple[Tensor, Tensor]:
     if spread == 0 and len(rows) > 1 and bool((cloud[rows] == middle).all()):
         raise UserError(f"All {len(rows)} points of the cloud are the same, {middle.tolist()}: nothing is to be seen.")
     limit = OUTLYING * spread if spread > 0 else 1e6
-    far = ~((cloud - middle).abs().amax(1) <= limit)
+    here = torch.ones(len(cloud), dtype=torch.bool, device=cloud.device)
+    for axis in range(3):  # one after the other, since there may be ten million points; NaN is not near
+        here &= (cloud[:, axis] - middle[axis]).abs_() <= limit
     if float(middle.abs().max()) > 1000.0:
         cloud, origin = cloud - middle, middle
-    return cloud.float().masked_fill(far[:, None], torch.nan), origin
+    return cloud.float() if bool(here.all()) else cloud.float().masked_fill(~here[:, None], torch.nan), origin
+
+
+def places(chosen: Tensor) -> Tensor:
+    """The places [n] int64 of the chosen among [N] bool."""
+    if bool(chosen.all()):
+        return torch.arange(len(chosen), device=chosen.device)
+    return chosen.nonzero().flatten()
 
 
 def draw(count: int, most: int) -> Tensor:
@@ -178,11 +188,11 @@ def nearest(points: Tensor, kept: Tensor, marked: Tensor, kept_marked: Tensor) -
     cells = filled.nonzero().flatten()
     axes = torch.stack([cells // 2 // _CELLS**axis % _CELLS for axis in range(3)], 1)
     middle = low + (axes + 0.5) * size
-    found = torch.zeros(len(filled), dtype=torch.int64)
+    found = torch.zeros(len(filled), dtype=torch.int32)  # of half the size, which is read all over
     for side in (False, True):
         among = (kept_marked == side).nonzero().flatten()
         among = among if len(among) else torch.arange(len(kept))
         mine = cells % 2 == int(side)
         _, index = cKDTree(kept[among]).query(middle[mine], workers=-1)
-        found[cells[mine]] = among[torch.from_numpy(np.asarray(index))]
-    return found[code]
+        found[cells[mine]] = among[torch.from_numpy(np.asarray(index))].int()
+    return found[code].long()

@@ -1,10 +1,12 @@
-"""Clouds in files of others: PLY, PCD, NPY, NPZ, text, and depth images with the intrinsics of their camera."""
+"""Clouds in files of others: PLY, PCD, NPY, NPZ, text, ROS recordings, and depth images with their intrinsics."""
 
 from __future__ import annotations
 
+import tokenize
 import zipfile
+import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.arrays import as_mask, as_points, near_origin
+from fb3d_rl.perception.arrays import as_mask, as_points, near_origin, places
+from fb3d_rl.perception.bags import BAGS, is_bag, read_bag
 from fb3d_rl.perception.depth import points_of, read_depth, read_intrinsics
 from fb3d_rl.perception.records import Fields, read_pcd, read_ply
 
@@ -42,6 +45,12 @@ DEPTH_PER_METRE = 1000.0
 
 MILLIMETRES = 50.0
 """A cloud that spans more is one in millimetres: 50 m seen at once, or 5 cm."""
+
+DAMAGE = (
+    ValueError, LookupError, TypeError, OverflowError, EOFError, SyntaxError, OSError, RuntimeError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What Python, NumPy and Pillow raise on a damaged file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,11 +93,14 @@ def read_cloud(
     scale: float | None = None,
     intrinsics: str | Path | None = None,
     depth_scale: float | None = None,
+    topic: str | None = None,
+    message: int = 0,
 ) -> CloudFile:
     """Read the cloud of a file.
 
     Args:
-        path: .ply, .pcd, .npy, .npz, .xyz, .txt, .csv, .pts or .asc; or a 16-bit .png (.tif) of depth.
+        path: .ply, .pcd, .npy, .npz, .xyz, .txt, .csv, .pts or .asc; a 16-bit .png (.tif) of depth; or a recording of
+            ROS with messages of type PointCloud2: .bag, .db3, .mcap, or a folder (needs rosbags).
         mask: the part to open: the name of a field (or array) of the file; "FIELD:ID", those of its points with this
             number; "box:X,Y,Z,X,Y,Z", what is between two corners, in metres in the file's frame; or a second file
             with a number for each point: .npy, .npz, .txt, or .png for a depth image. Numbers mean what
@@ -97,27 +109,35 @@ def read_cloud(
         intrinsics: of a depth image's camera, .json or .yaml; None: a file of that name beside the image, or
             intrinsics.json.
         depth_scale: units of a depth image in a metre; None: what the intrinsics say, else 1000.
+        topic: of a recording; None if it has clouds on one only.
+        message: which of the topic's messages, from 0 on.
 
     Raises:
         UserError: a file is missing, damaged or something else; the sentence names it.
     """
     file = Path(path)
-    if not file.is_file():
+    kind, recording = file.suffix.lower(), is_bag(file)
+    if not file.is_file() and not (recording and file.is_dir()):
         raise UserError(f"There is no file {file}: check the path.")
-    kind = file.suffix.lower()
-    if kind not in (*READERS, *IMAGES):
-        raise UserError(f"{file} is of no kind that is read: {', '.join((*READERS, *IMAGES))}.")
-    raw = _read(file, READERS[kind]) if kind in READERS else _depth_image(file, intrinsics, depth_scale)
+    if recording:
+        raw = _read(file, lambda bag: _message(bag, topic, message))
+    elif kind in READERS:
+        raw = _read(file, READERS[kind])
+    elif kind in IMAGES:
+        raw = _depth_image(file, intrinsics, depth_scale)
+    else:
+        raise UserError(f"{file} is of no kind that is read: {', '.join((*READERS, *IMAGES, *BAGS))}.")
     points = as_points(raw.points)
     if not len(points):
         raise UserError(f"{file} holds no points.")
     cleaned, _ = near_origin_of(file, points)
     measured = cleaned.isfinite().all(1) & (points != 0).any(1)
-    rows = measured.nonzero().flatten().numpy()
+    rows = places(measured).numpy()
     if len(rows) < 3:
         raise UserError(f"{file} holds {len(rows)} measured points: all others are zero or not finite.")
-    cloud, remarks = points.numpy()[rows], [raw.remark] if raw.remark else []
-    if len(rows) < len(points):
+    everything = len(rows) == len(points)
+    cloud, remarks = points.numpy() if everything else points.numpy()[rows], [raw.remark] if raw.remark else []
+    if not everything:
         remarks.append(f"{len(points) - len(rows):,} of {len(points):,} points are missing (zero or not finite)")
     span = float(np.linalg.norm(np.subtract(*np.percentile(cloud[:: max(1, len(cloud) // 10_000)], (99, 1), axis=0))))
     if scale is None and span > MILLIMETRES:
@@ -144,7 +164,7 @@ def _read(file: Path, reader: Callable[[Path], _Raw]) -> _Raw:
         return reader(file)
     except UserError as error:
         raise UserError(f"{file} {error}.") from error
-    except (ValueError, KeyError, IndexError, TypeError, OverflowError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         why = " ".join(str(error).split())[:120]
         raise UserError(f"{file} is damaged or no {file.suffix.lower()} file ({why}): export it anew.") from error
     except MemoryError as error:
@@ -165,6 +185,12 @@ def _ply(file: Path) -> _Raw:
 
 def _pcd(file: Path) -> _Raw:
     return _of_fields(*read_pcd(file.read_bytes()))
+
+
+def _message(bag: Path, topic: str | None, message: int) -> _Raw:
+    fields, optical, remark = read_bag(bag, topic, message)
+    raw = _of_fields(fields, np.zeros(3) if optical else None)
+    return replace(raw, optical=optical, remark=remark)
 
 
 def _of_array(array: NDArray[Any], others: Fields) -> _Raw:
@@ -316,5 +342,5 @@ def _mask_file(file: Path) -> NDArray[Any]:
                     content = np.empty(0) if name is None else content[name]
                 return np.asarray(content).reshape(-1)
         return np.loadtxt(file, ndmin=1, delimiter="," if "," in file.read_text("latin-1")[:1000] else None).reshape(-1)
-    except (ValueError, KeyError, IndexError, EOFError, OSError, SyntaxError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise UserError(f"{file} is damaged or no mask ({' '.join(str(error).split())[:120]}).") from error

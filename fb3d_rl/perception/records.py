@@ -1,12 +1,13 @@
 """The points of PLY and PCD files: a header in text that names the fields, then one record for each point.
 
 Read with NumPy: plyfile is under the GPL, trimesh turns a text PLY line by line into a mesh, and pypcd4 needs two
-compiled packages and refuses headers that PCL reads.
+compiled packages and refuses headers that PCL reads. Compressed points are unpacked by h5py.
 """
 
 from __future__ import annotations
 
 import io
+import os
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,12 @@ _HEADER = 1 << 16
 
 _NUMBERS = 10_000
 """Numbers of a point; descriptors have some hundred."""
+
+MARK = 32
+"""Bytes of a mark behind compressed data: as many as LZF keeps as they are in one piece."""
+
+LZF_GAIN = 88
+"""LZF makes of one byte at most so many: of three 264."""
 
 _PLY_TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -161,35 +168,27 @@ def _records(data: bytes, start: int, properties: list[tuple[str, str]], count: 
     return dict(zip(names, table.T, strict=True))
 
 
-def unpack_lzf(packed: bytes, size: int) -> bytes:
+def unpack_lzf(packed: bytes, size: int) -> NDArray[np.uint8]:
     """What LibLZF compressed into ``packed``: ``size`` bytes.
+
+    HDF5's filter of this name unpacks it, as the one chunk of a data set in memory. It does not say how much came out:
+    a mark behind the data has to be found where they are to end.
 
     Raises:
         UserError: it is no such data.
     """
-    out, i = bytearray(), 0
-    try:
-        while i < len(packed) and len(out) <= size:
-            control = packed[i]
-            i += 1
-            if control < 32:  # so many bytes and one as they are
-                out += packed[i : i + control + 1]
-                i += control + 1
-                continue
-            length = control >> 5
-            if length == 7:
-                length += packed[i]
-                i += 1
-            length += 2
-            back = ((control & 31) << 8) + packed[i] + 1
-            i += 1
-            begin = len(out) - back
-            if begin < 0:
-                break
-            piece = out[begin : begin + length]
-            out += (piece * (length // back + 1))[:length] if back < length else piece
-    except IndexError:
-        pass
-    if len(out) != size:
+    import h5py  # late: few files are compressed
+
+    mark, out = os.urandom(MARK), np.empty(0, dtype=np.uint8)
+    if size <= LZF_GAIN * len(packed) and len(packed) <= 2 * size:
+        with h5py.File("lzf", "w", driver="core", backing_store=False) as file:
+            chunk = (size + MARK,)
+            data = file.create_dataset("lzf", chunk, "u1", chunks=chunk, compression="lzf")
+            data.id.write_direct_chunk((0,), b"".join((packed, bytes([MARK - 1]), mark)))
+            try:
+                out = data[:]
+            except OSError:
+                pass
+    if out[size:].tobytes() != mark:
         raise UserError("is damaged: its compressed points cannot be unpacked")
-    return bytes(out)
+    return out[:size]

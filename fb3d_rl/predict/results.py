@@ -9,8 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fb3d_rl.files import replacing, write_bytes, write_text
+from fb3d_rl.files import replacing, write_text
 from fb3d_rl.predict.plan import Hypothesis, Plan
+
+PIECE = 1 << 16
+"""Points that are written at a time: so many stay in the processor's cache."""
 
 VECTORS = ("contact_point", "pull", "standoff", "precontact_point", "rotation", "quaternion")
 """What a hypothesis has besides its flow and its probability."""
@@ -75,9 +78,6 @@ def write_ply(path: Path, plan: Plan) -> None:
     fields.append(("foreground", "u1", plan.foreground))
     if plan.part is not None:
         fields.append(("part_mask", "u1", plan.part))
-    records = np.empty(len(plan.points), dtype=[(name, f"<{code}") for name, code, _ in fields])
-    for name, _, values in fields:
-        records[name] = values
     names = {"f4": "float", "f8": "double", "u1": "uchar"}
     properties = [f"property {names[code]} {name}" for name, code, _ in fields]
     lines = [
@@ -85,5 +85,12 @@ def write_ply(path: Path, plan: Plan) -> None:
         "format binary_little_endian 1.0",
         "comment metres; flow: which way each point moves, largest about 1",
     ]
-    header = "\n".join([*lines, f"element vertex {len(records)}", *properties, "end_header", ""])
-    write_bytes(path, header.encode("ascii"), records.data.cast("B"))
+    header = "\n".join([*lines, f"element vertex {len(plan.points)}", *properties, "end_header", ""])
+    records = np.empty(PIECE, dtype=[(name, f"<{code}") for name, code, _ in fields])
+    with replacing(path) as beside, beside.open("wb") as file:
+        file.write(header.encode("ascii"))
+        for start in range(0, len(plan.points), PIECE):
+            for name, _, values in fields:
+                piece = values[start : start + PIECE]
+                records[name][: len(piece)] = piece
+            file.write(records[: len(piece)].data.cast("B"))

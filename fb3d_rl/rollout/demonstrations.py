@@ -16,12 +16,10 @@ from torch import Tensor
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.catalog import procedural_catalog
-from fb3d_rl.camera.raycast import CameraOptions
-from fb3d_rl.camera.views import ViewRange
 from fb3d_rl.contract import Key, spec
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
-from fb3d_rl.env.options import EnvOptions, GripperOptions, SuctionOptions, Trial
+from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.errors import UserError
 from fb3d_rl.importer.catalog import path_catalog
 from fb3d_rl.policies.flow_policy import expert_policy
@@ -177,14 +175,8 @@ def recorded_options(buffer: DemonstrationBuffer) -> EnvOptions:
         UserError: they are unknown, or from another version.
     """
     try:
-        env: dict[str, Any] = dict(buffer.about["env"])
-        views = {key: tuple(ends) for key, ends in env.pop("views").items()}
-        gripper, suction, camera = (env.pop(key) for key in ("gripper", "suction", "camera"))
-        return EnvOptions(
-            gripper=GripperOptions(**gripper), suction=SuctionOptions(**suction), camera=CameraOptions(**camera),
-            views=ViewRange(**views), **env,
-        )  # fmt: skip
-    except (KeyError, TypeError, AttributeError) as error:
+        return EnvOptions.of(buffer.about["env"])
+    except (KeyError, TypeError, AttributeError, UserError) as error:
         raise UserError(f"{buffer.path} does not say how it was recorded, so it cannot be run again") from error
 
 

@@ -87,7 +87,10 @@ def door_of(obj: ArticulatedObject) -> tuple[Mesh, ...]:
     return link.visuals
 
 
-@pytest.mark.parametrize("kind", ["obj", "stl", "dae", "ply", "off", "glb", "gltf"])
+FORMATS = ["obj", "stl", "dae", "ply", "off", "glb", "gltf"]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
 def test_every_format_of_a_mesh_is_read(tmp_path: Path, kind: str) -> None:
     if kind not in trimesh.available_formats():
         pytest.skip(f"trimesh reads no .{kind} here")
@@ -112,15 +115,15 @@ def test_a_format_whose_reader_is_not_installed_names_the_package(
     )
 
 
-@pytest.mark.parametrize(
-    ("shape", "solid"),
-    [
-        ('<box size="1 2 3"/>', trimesh.creation.box((1, 2, 3))),
-        ('<cylinder radius="0.5" length="2"/>', trimesh.creation.cylinder(0.5, 2.0)),
-        ('<sphere radius="0.5"/>', trimesh.creation.icosphere(radius=0.5)),
-        ('<capsule radius="0.5" length="2"/>', None),
-    ],
-)
+SHAPES = [
+    ('<box size="1 2 3"/>', trimesh.creation.box((1, 2, 3))),
+    ('<cylinder radius="0.5" length="2"/>', trimesh.creation.cylinder(0.5, 2.0)),
+    ('<sphere radius="0.5"/>', trimesh.creation.icosphere(radius=0.5)),
+    ('<capsule radius="0.5" length="2"/>', None),
+]
+
+
+@pytest.mark.parametrize(("shape", "solid"), SHAPES)
 def test_primitives_are_meshes(tmp_path: Path, shape: str, solid: trimesh.Trimesh | None) -> None:
     origin = '<origin xyz="1 2 3" rpy="0.1 0.2 0.3"/>'
     (made,) = door_of(load_object(put(tmp_path, robot(geometry(shape, origin=origin)))))
@@ -143,34 +146,38 @@ def test_a_link_has_as_many_shapes_as_its_file(tmp_path: Path) -> None:
     assert_surface(door_of(load_object(put(tmp_path, robot(shapes)))), *solids)
 
 
-@pytest.mark.parametrize(
-    ("name", "file"),
-    [
-        ("meshes/a.obj", "meshes/a.obj"),
-        ("./meshes/../meshes/a.obj", "meshes/a.obj"),
-        ("meshes\\a.obj", "meshes/a.obj"),
-        ("my meshes/tür 1.obj", "my meshes/tür 1.obj"),
-        ("my%20meshes/t%C3%BCr.obj", "my meshes/tür.obj"),
-        ("100%25.obj", "100%25.obj"),
-        ("a.OBJ", "a.OBJ"),
-        ("package://my_cab/meshes/a.obj", "meshes/a.obj"),
-        ("package://my_cab//meshes/a.obj", "meshes/a.obj"),
-        ("package://other/meshes/a%20b.obj", "meshes/a b.obj"),
-        ("package://other/a.obj", "other/a.obj"),
-        ("model://my_cab/a.obj", "a.obj"),
-        ("file://meshes/a.obj", "meshes/a.obj"),
-        ("file://FOLDER/meshes/a.obj", "meshes/a.obj"),
-        ("file://localhostFOLDER/a%20b.obj", "a b.obj"),
-        ("FOLDER/meshes/a.obj", "meshes/a.obj"),
-    ],
-)
+NAMED = [
+    ("meshes/a.obj", "meshes/a.obj"),
+    ("./meshes/../meshes/a.obj", "meshes/a.obj"),
+    ("meshes\\a.obj", "meshes/a.obj"),
+    ("my meshes/tür 1.obj", "my meshes/tür 1.obj"),
+    ("my%20meshes/t%C3%BCr.obj", "my meshes/tür.obj"),
+    ("100%25.obj", "100%25.obj"),
+    ("a.OBJ", "a.OBJ"),
+    ("package://my_cab/meshes/a.obj", "meshes/a.obj"),
+    ("package://my_cab//meshes/a.obj", "meshes/a.obj"),
+    ("package://other/meshes/a%20b.obj", "meshes/a b.obj"),
+    ("package://other/a.obj", "other/a.obj"),
+    ("model://my_cab/a.obj", "a.obj"),
+    ("file://meshes/a.obj", "meshes/a.obj"),
+    ("file://FOLDER/meshes/a.obj", "meshes/a.obj"),
+    ("file://localhostFOLDER/a%20b.obj", "a b.obj"),
+    ("FOLDER/meshes/a.obj", "meshes/a.obj"),
+]
+"""What a mesh is called, and the file that is meant; FOLDER is the object's."""
+
+
+@pytest.mark.parametrize(("name", "file"), NAMED)
 def test_a_mesh_is_found_however_it_is_named(tmp_path: Path, name: str, file: str) -> None:
     folder = tmp_path / "my_cab"
     urdf = robot(mesh(name.replace("FOLDER", folder.as_posix())))
     assert_surface(door_of(load_object(put(folder, urdf, {file: written("obj")["a.obj"]}))), SOLID)
 
 
-@pytest.mark.parametrize("scale", ["2 0.5 4", "-1 1 1", "-1 -2 1", "1 -1 -1", "-1 -1 -1", "0.001"])
+SCALES = ["2 0.5 4", "-1 1 1", "-1 -2 1", "1 -1 -1", "-1 -1 -1", "0.001"]
+
+
+@pytest.mark.parametrize("scale", SCALES)
 def test_a_scale_keeps_the_outside_out(tmp_path: Path, scale: str) -> None:
     factors = np.broadcast_to([float(word) for word in scale.split()], 3)
     (made,) = door_of(load_object(put(tmp_path, robot(mesh("a.obj", f'scale="{scale}"')))))
@@ -189,23 +196,24 @@ def test_a_link_without_one_kind_of_shape_gets_the_other(tmp_path: Path, tag: st
     assert "link door: no" in remark and not obj.lost
 
 
-@pytest.mark.parametrize(
-    ("kind", "limit", "wanted"),
-    [
-        ("revolute", '<limit lower="0" upper="90"/>', (0.0, math.pi / 2)),
-        ("revolute", '<limit lower="110" upper="-10"/>', (math.radians(-10), math.radians(110))),
-        ("revolute", '<limit lower="-360" upper="0"/>', (-2 * math.pi, 0.0)),
-        ("revolute", "", (0.0, math.pi / 2)),
-        ("revolute", '<limit effort="1" velocity="1"/>', (0.0, math.pi / 2)),
-        ("revolute", '<limit lower="-inf" upper="inf"/>', (0.0, math.pi / 2)),
-        ("revolute", '<limit lower="-1e16" upper="1e16"/>', (0.0, math.pi / 2)),
-        ("revolute", '<limit lower="-0.5" upper="inf"/>', (-0.5, math.pi / 2 - 0.5)),
-        ("revolute", '<limit lower="-inf" upper="0"/>', (-math.pi / 2, 0.0)),
-        ("prismatic", "", (0.0, 0.5)),
-        ("prismatic", '<limit lower="1e9" upper="-0.25"/>', (-0.25, 0.25)),
-        ("revolute", '<limit lower="1.5" upper="0"/>', (0.0, 1.5)),
-    ],
-)
+LIMITS = [
+    ("revolute", '<limit lower="0" upper="90"/>', (0.0, math.pi / 2)),
+    ("revolute", '<limit lower="110" upper="-10"/>', (math.radians(-10), math.radians(110))),
+    ("revolute", '<limit lower="-360" upper="0"/>', (-2 * math.pi, 0.0)),
+    ("revolute", "", (0.0, math.pi / 2)),
+    ("revolute", '<limit effort="1" velocity="1"/>', (0.0, math.pi / 2)),
+    ("revolute", '<limit lower="-inf" upper="inf"/>', (0.0, math.pi / 2)),
+    ("revolute", '<limit lower="-1e16" upper="1e16"/>', (0.0, math.pi / 2)),
+    ("revolute", '<limit lower="-0.5" upper="inf"/>', (-0.5, math.pi / 2 - 0.5)),
+    ("revolute", '<limit lower="-inf" upper="0"/>', (-math.pi / 2, 0.0)),
+    ("prismatic", "", (0.0, 0.5)),
+    ("prismatic", '<limit lower="1e9" upper="-0.25"/>', (-0.25, 0.25)),
+    ("revolute", '<limit lower="1.5" upper="0"/>', (0.0, 1.5)),
+]
+"""Of a joint of some type, and what is made of them."""
+
+
+@pytest.mark.parametrize(("kind", "limit", "wanted"), LIMITS)
 def test_limits_are_mended_and_it_is_said(tmp_path: Path, kind: str, limit: str, wanted: tuple[float, float]) -> None:
     hinge = DOOR.replace("revolute", kind).replace('<limit lower="0" upper="1.5"/>', limit)
     obj = load_object(put(tmp_path, robot(hinge=hinge)))
@@ -307,48 +315,49 @@ def test_followers_of_nothing(tmp_path: Path, mimic: str, hinge: str, says: str,
 # ------------------------------------------------------------------------------------------------ sentences
 
 
-@pytest.mark.parametrize(
-    ("urdf", "word"),
-    [
-        (robot(mesh("b.obj")), "b.obj is missing"),
-        (robot(mesh("package://nowhere/b.obj")), r"missing in .* assets.packages"),
-        (robot(mesh("a.step")), "no .obj, .stl"),
-        (robot(mesh("http://example.org/a.obj")), "no file of this machine"),
-        (robot(mesh("../secret.obj")), "leaves"),
-        (robot(mesh("%2e%2e/secret.obj")), "leaves"),
-        (robot(mesh("package://a/../secret.obj")), "leaves"),
-        (robot(mesh("package://../secret.obj")), "leaves"),
-        (robot(mesh("file:///etc/passwd")), "leaves"),
-        (robot(mesh("link.obj")), "leaves"),
-        (robot(mesh("up/secret.obj")), "leaves"),
-        (robot(mesh("b&#0;.obj".replace("&#0;", "x" * 5000))), "cannot be followed|missing"),
-        (robot(mesh("a.obj", 'scale="0 1 1"')), "scale"),
-        (robot(mesh("a.obj", 'scale="0"')), "scale"),
-        (robot(mesh("a.obj", 'scale="1 1"')), "1 1"),
-        (robot(mesh("a.obj", 'scale="a b c"')), "a b c"),
-        (robot(geometry("<mesh/>")), "filename"),
-        (robot(geometry("<box/>")), "size"),
-        (robot(geometry('<box size="1 2"/>')), "1 2"),
-        (robot(geometry('<box size="1 0 1"/>')), "size 1 0 1"),
-        (robot(geometry('<sphere radius="-1"/>')), "size -1"),
-        (robot(geometry('<cylinder radius="1"/>')), "length"),
-        (robot(geometry('<cylinder radius="1" length="nan"/>')), "nan"),
-        (robot(geometry('<capsule radius="1e9" length="1"/>')), "1e"),
-        (robot(hinge=DOOR.replace("revolute", "helical")), "helical"),
-        (robot(hinge=DOOR.replace('upper="1.5"', 'upper="wide"')), "no numbers"),
-        (robot(hinge=DOOR.replace("</joint>", "<mimic/></joint>")), "joint"),
-        (robot(hinge=DOOR.replace("</joint>", '<mimic joint="hinge"/></joint>')), "follows itself"),
-        (robot(hinge=DOOR.replace("</joint>", '<mimic joint="x" multiplier="y"/></joint>')), "y"),
-        (robot(more=f'<link name="stray">{BOX}</link>'), "2 roots"),
-        (robot(more="<xacro:include/>"), "xacro"),
-        (robot(head='<robot xmlns:xacro="http://ros.org/wiki/xacro">', more="<xacro:include/>"), "xacro .* expanded"),
-        (robot(geometry('<box size="${width} 1 1"/>')), "xacro"),
-        (robot(mesh("$(find my_cab)/a.obj")), "xacro"),
-        ("<mujoco/>", "no URDF"),
-        ("<sdf/>", "no URDF"),
-        ("", "XML"),
-    ],
-)  # fmt: skip
+BROKEN = [
+    (robot(mesh("b.obj")), "b.obj is missing"),
+    (robot(mesh("package://nowhere/b.obj")), r"missing in .* assets.packages"),
+    (robot(mesh("a.step")), "no .obj, .stl"),
+    (robot(mesh("http://example.org/a.obj")), "no file of this machine"),
+    (robot(mesh("../secret.obj")), "leaves"),
+    (robot(mesh("%2e%2e/secret.obj")), "leaves"),
+    (robot(mesh("package://a/../secret.obj")), "leaves"),
+    (robot(mesh("package://../secret.obj")), "leaves"),
+    (robot(mesh("file:///etc/passwd")), "leaves"),
+    (robot(mesh("link.obj")), "leaves"),
+    (robot(mesh("up/secret.obj")), "leaves"),
+    (robot(mesh("b&#0;.obj".replace("&#0;", "x" * 5000))), "cannot be followed|missing"),
+    (robot(mesh("a.obj", 'scale="0 1 1"')), "scale"),
+    (robot(mesh("a.obj", 'scale="0"')), "scale"),
+    (robot(mesh("a.obj", 'scale="1 1"')), "1 1"),
+    (robot(mesh("a.obj", 'scale="a b c"')), "a b c"),
+    (robot(geometry("<mesh/>")), "filename"),
+    (robot(geometry("<box/>")), "size"),
+    (robot(geometry('<box size="1 2"/>')), "1 2"),
+    (robot(geometry('<box size="1 0 1"/>')), "size 1 0 1"),
+    (robot(geometry('<sphere radius="-1"/>')), "size -1"),
+    (robot(geometry('<cylinder radius="1"/>')), "length"),
+    (robot(geometry('<cylinder radius="1" length="nan"/>')), "nan"),
+    (robot(geometry('<capsule radius="1e9" length="1"/>')), "1e"),
+    (robot(hinge=DOOR.replace("revolute", "helical")), "helical"),
+    (robot(hinge=DOOR.replace('upper="1.5"', 'upper="wide"')), "no numbers"),
+    (robot(hinge=DOOR.replace("</joint>", "<mimic/></joint>")), "joint"),
+    (robot(hinge=DOOR.replace("</joint>", '<mimic joint="hinge"/></joint>')), "follows itself"),
+    (robot(hinge=DOOR.replace("</joint>", '<mimic joint="x" multiplier="y"/></joint>')), "y"),
+    (robot(more=f'<link name="stray">{BOX}</link>'), "2 roots"),
+    (robot(more="<xacro:include/>"), "xacro"),
+    (robot(head='<robot xmlns:xacro="http://ros.org/wiki/xacro">', more="<xacro:include/>"), "xacro .* expanded"),
+    (robot(geometry('<box size="${width} 1 1"/>')), "xacro"),
+    (robot(mesh("$(find my_cab)/a.obj")), "xacro"),
+    ("<mujoco/>", "no URDF"),
+    ("<sdf/>", "no URDF"),
+    ("", "XML"),
+]  # fmt: skip
+"""Files that cannot be read, and what is said."""
+
+
+@pytest.mark.parametrize(("urdf", "word"), BROKEN)
 def test_what_cannot_be_read_ends_in_one_sentence(tmp_path: Path, urdf: str, word: str) -> None:
     folder = put(tmp_path / "a", urdf)
     (tmp_path / "secret.obj").write_bytes(written("obj")["a.obj"])
@@ -385,9 +394,9 @@ RICH = robot(
 )
 
 
-def mutated(rng: np.random.Generator) -> bytes:
-    """The rich URDF with bytes changed, a tag dropped or doubled, or a value taken from elsewhere."""
-    data = bytearray(RICH.encode())
+def mutated(rng: np.random.Generator, urdf: str = RICH) -> bytes:
+    """A URDF with bytes changed, a tag dropped or doubled, or a value taken from elsewhere."""
+    data = bytearray(urdf.encode())
     for _ in range(rng.integers(1, 4)):
         kind = rng.integers(4)
         if kind == 0:

@@ -21,13 +21,17 @@ from .test_files import cupboard, put
 def test_files_are_imported_as_folders_and_what_was_changed_is_said(tmp_path: Path, launch: Launch) -> None:
     put(tmp_path / "in/small.urdf")
     put(tmp_path / "in/large.urdf", cupboard(1000.0))
-    arguments = ["import", "in", "--out", "out", "--category", "Safe", "--front=-x"]
+    arguments = ["import", "in", "--out", "out", "--category", "Safe", "--front", "-x"]
     done = launch("objects.py", *arguments, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "millimetres" in " ".join(done.stdout.split()) and "2 objects: out; 0 cannot" in done.stdout
     assert load_object(tmp_path / "out/large").category == "Safe"
     again = launch("objects.py", *arguments, cwd=tmp_path)
     assert again.returncode == 2 and "exists already" in again.stderr
+    other = launch("objects.py", "import", "--front=+x", "in/small.urdf", "--scale", "cm", "--out", "cm", cwd=tmp_path)
+    assert other.returncode == 0 and "0.01 times" in (said := " ".join(other.stdout.split())) and "faced +x" in said
+    wrong = launch("objects.py", "import", "in", "--front", "-z", "--out", "no", cwd=tmp_path)
+    assert wrong.returncode == 2 and "--front" in wrong.stderr
     put(tmp_path / "broken.urdf", "<mujoco/>")
     broken = launch("objects.py", "import", "broken.urdf", "in/small.urdf", "--out", "two", cwd=tmp_path)
     assert broken.returncode == 1 and "no URDF" in " ".join(broken.stdout.split())

@@ -21,7 +21,7 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.importer.catalog import files_catalog, find_objects, path_catalog
 from fb3d_rl.importer.files import find_files
 from fb3d_rl.importer.folders import write_folder
-from fb3d_rl.importer.frames import Frame, front_of
+from fb3d_rl.importer.frames import Frame, front_of, scaled, unit_of
 from fb3d_rl.importer.reading import examine_file, read_file
 from fb3d_rl.kinematics.opening import standing_bounds
 from fb3d_rl.kinematics.tree import KinematicTree
@@ -77,12 +77,9 @@ def assert_same(one: ArticulatedObject, two: ArticulatedObject, turn: np.ndarray
     assert [two.links[i].name for i in two.movable] == [one.links[i].name for i in one.movable]
     np.testing.assert_allclose(one.limits, two.limits, atol=1e-6)
     for share in (0.0, 0.3, 1.0):
-        poses = [
-            KinematicTree.from_object(obj)
-            .forward(torch.as_tensor(obj.limits[:, 0] + share * np.ptp(obj.limits, axis=1)))
-            .numpy()
-            for obj in (one, two)
-        ]
+        low, high = np.clip(two.limits, -7, 7).T  # of those without limits, too
+        state = torch.as_tensor(low + share * (high - low))
+        poses = [KinematicTree.from_object(obj).forward(state).numpy() for obj in (one, two)]
         for i, link in enumerate(two.links):
             j = one.index(link.name)
             np.testing.assert_allclose(poses[0][j], (np.eye(4) if turn is None else turn) @ poses[1][i], atol=1e-6)
@@ -178,15 +175,61 @@ def test_millimetres_are_recognised_and_said(tmp_path: Path, original: Articulat
     )
 
 
-def test_meshes_in_other_units_than_the_joints(tmp_path: Path, original: ArticulatedObject) -> None:
+@pytest.mark.parametrize(
+    ("per_metre", "board", "taken", "other"),
+    [
+        (100.0, 0.02, "centimetres", "inches"),
+        (1 / 0.0254, 0.02, "inches", "centimetres"),
+        (100.0, 0.2, "centimetres", "inches"),
+        (1000.0, 0.02, "millimetres", None),
+    ],
+)
+def test_units_are_recognised_by_size_and_boards(
+    tmp_path: Path, per_metre: float, board: float, taken: str, other: str | None
+) -> None:
+    """What fits as well is named, with the word that settles it; that word gives the same object without a doubt."""
+    text, metres = (
+        cupboard(unit).replace(f'size="{unit * 0.02} ', f'size="{unit * board} ') for unit in (per_metre, 1.0)
+    )
+    obj = read(put(tmp_path / "a.urdf", text))
+    assert_same(obj, read(put(tmp_path / "b.urdf", metres)))
+    [remark] = obj.dropped
+    assert f"taken as {taken}" in remark and ("may be" in remark) == (other is not None)
+    if other is not None:
+        assert other in remark
+        unit = {"centimetres": "cm", "inches": "inch"}[taken]
+        told = read(put(tmp_path / "c.urdf", text), AssetsOptions(scale=unit).metres)
+        assert_same(told, obj)
+        assert "may be" not in told.dropped[0]
+
+
+@pytest.mark.parametrize(
+    ("size", "unit", "others"),
+    [
+        (1.9, "m", []), (4.9, "m", []), (12.0, "m", ["inch"]), (19.9, "m", ["inch"]), (20.1, "cm", ["inch"]),
+        (60.0, "cm", ["inch"]), (198.0, "cm", []), (210.0, "mm", ["cm"]), (499.0, "mm", ["cm"]), (2000.0, "mm", []),
+        (30000.0, "mm", []),
+    ],
+)  # fmt: skip
+def test_which_sizes_are_plausible(original: ArticulatedObject, size: float, unit: str, others: list[str]) -> None:
+    """Of an object whose boards tell nothing: they are too thin in all units."""
+    found, said = unit_of(scaled(original, 1e-4, {}), size)
+    assert found == unit and re.findall(r"scale=(\w+)", said) == others
+    assert bool(said) == (unit != "m" or bool(others))
+
+
+@pytest.mark.parametrize(("per_metre", "word"), [(100.0, "centimetres"), (1000.0, "millimetres")])
+def test_meshes_in_other_units_than_the_joints(
+    tmp_path: Path, original: ArticulatedObject, per_metre: float, word: str
+) -> None:
     text = cupboard()
     for number, (size, _) in enumerate(BOXES.values()):
-        solid = trimesh.creation.box(np.array(size) * 1000)
+        solid = trimesh.creation.box(np.array(size) * per_metre)
         (tmp_path / f"{number}.obj").write_text(solid.export(file_type="obj", digits=12))
         text = text.replace(f'<box size="{words(size, 1.0)}"/>', f'<mesh filename="{number}.obj"/>')
     obj = read(put(tmp_path / "a.urdf", text))
     np.testing.assert_allclose(standing_bounds(obj), standing_bounds(original), atol=1e-6)
-    assert any("meshes" in remark and "millimetres" in remark for remark in obj.dropped)
+    assert any("meshes" in remark and word in remark for remark in obj.dropped)
 
 
 @pytest.mark.parametrize(("front", "quarters"), [("+y", 3), ("+x", 2), ("-y", 1)])
@@ -297,6 +340,11 @@ def test_a_catalog_of_files(tmp_path: Path) -> None:
     assert [obj.id for obj in find_objects(tmp_path / "in/a.urdf")] == ["a"]
     with pytest.raises(UserError, match="no object can be used.*broken"):
         files_catalog(replace(assets, root=str(tmp_path / "in/broken.urdf")))
+
+
+@pytest.mark.parametrize(("word", "metres"), [("m", 1.0), ("mm", 0.001), ("cm", 0.01), ("inch", 0.0254), ("0.5", 0.5)])
+def test_a_scale_is_a_unit_or_a_number(word: str, metres: float) -> None:
+    assert AssetsOptions(source="files", root="a", scale=word).metres == metres
 
 
 @pytest.mark.parametrize("scale", ["0", "-1", "inf", "big", None])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -307,17 +308,20 @@ def test_a_picture_is_no_depth_and_intrinsics_have_to_fit(tmp_path: Path) -> Non
 
 def test_lzf() -> None:
     data = b"abc" * 100 + bytes(600) + b"x" * 5
-    assert unpack_lzf(pack_lzf(data), len(data)) == data
+    assert unpack_lzf(pack_lzf(data), len(data)).tobytes() == data
     overlapping = bytes([2]) + b"abc" + bytes([7 << 5, 20, 2])  # 29 bytes from three before
-    assert unpack_lzf(overlapping, 32) == (b"abc" * 11)[:32]
-    for broken, size in ((pack_lzf(data)[:-1], len(data)), (pack_lzf(data), 10), (bytes([255, 255, 255]), 9), (b"", 4)):
+    assert unpack_lzf(overlapping, 32).tobytes() == (b"abc" * 11)[:32]
+    assert not len(unpack_lzf(b"", 0))
+    packed = pack_lzf(data)
+    broken = [(packed[:-1], len(data)), (packed, 10), (packed, len(data) - 1), (packed, len(data) + 1)]
+    for wrong, size in (*broken, (bytes([255, 255, 255]), 9), (b"", 4), (packed, 2**32 - 1)):
         with pytest.raises(UserError):
-            unpack_lzf(broken, size)
+            unpack_lzf(wrong, size)
 
 
 def _fuzz(tmp_path: Path, seeds: range, read: Callable[[Path], Any]) -> int:
     """Read files with some bytes changed, cut or repeated; returns how many were read all the same."""
-    kinds, fine = [name for name in FORMATS if name.startswith(("ply", "pcd"))], 0
+    kinds, fine = list(FORMATS), 0
     for seed in seeds:
         rng = np.random.default_rng(seed)
         file, content = FORMATS[kinds[seed % len(kinds)]]
@@ -355,3 +359,10 @@ def test_changed_bytes_never_crash(tmp_path: Path) -> None:
 @pytest.mark.timeout(200)
 def test_many_more_changed_bytes_never_crash(tmp_path: Path) -> None:
     assert _fuzz(tmp_path, range(300, 2300), read_cloud) > 100
+
+
+def test_a_recording_says_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0")
+    with pytest.raises(UserError, match=r'a\.bag is a recording of ROS, which needs rosbags: pip install "fb3d_rl'):
+        read_cloud(tmp_path / "a.bag")
