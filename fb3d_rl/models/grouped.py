@@ -303,8 +303,8 @@ def _largest(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _behind_winners(winner: Tensor, gradient: Tensor, weights: Tensor, slots: int) -> Tensor:
-    """Gradient [slots, C2] of the last layer's inputs from that of its maxima [Q, C3], of which ``winner`` names the slot;
-    weights [C3, C2].
+    """Gradient [slots, C2] of the last layer's inputs from that of its maxima [Q, C3], of which ``winner`` names the
+    slots; weights [C3, C2].
     """
     if _at_once(gradient):
         return gradient.new_zeros(slots, gradient.shape[1]).scatter_(0, winner, gradient) @ weights

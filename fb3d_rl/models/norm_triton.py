@@ -1,5 +1,5 @@
-"""Batch norm of the rows that are present, and ReLU, as Triton kernels: each pass reads and writes memory once, which is
-all that it takes time for.
+"""Batch norm of the rows that are present, and ReLU, as Triton kernels: a pass reads and writes memory once, which is
+what takes time.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def moments(rows, present, partial, count, channels, size: tl.constexpr, block: 
 
 @triton.jit
 def apply(rows, scale, shift, output, count, channels, size: tl.constexpr, block: tl.constexpr):  # type: ignore[no-untyped-def]
-    """relu(rows * scale + shift)."""
+    """Write relu(rows * scale + shift)."""
     row = tl.program_id(0).to(tl.int64) * size + tl.arange(0, size)
     channel = tl.arange(0, block)
     inside = (row < count)[:, None] & (channel < channels)[None, :]
@@ -42,8 +42,10 @@ def apply(rows, scale, shift, output, count, channels, size: tl.constexpr, block
 
 
 @triton.jit
-def slopes(gradient, rows, output, present, mean, partial, count, channels, size: tl.constexpr, block: tl.constexpr):  # type: ignore[no-untyped-def]
-    """Sums of dz and of dz (rows - mean), dz the gradient behind ReLU, of the rows present -> partial [G, 2, channels]."""
+def slopes(  # type: ignore[no-untyped-def]
+    gradient, rows, output, present, mean, partial, count, channels, size: tl.constexpr, block: tl.constexpr
+):
+    """Sums of dz and of dz (rows - mean), dz the gradient behind ReLU, of those present -> partial [G, 2, channels]."""
     row = tl.program_id(0).to(tl.int64) * size + tl.arange(0, size)
     channel = tl.arange(0, block)
     inside = (row < count)[:, None] & (channel < channels)[None, :]
@@ -59,8 +61,11 @@ def slopes(gradient, rows, output, present, mean, partial, count, channels, size
 
 
 @triton.jit
-def spread(gradient, rows, output, present, mean, scale, level, slope, result, count, channels, size: tl.constexpr, block: tl.constexpr):  # type: ignore[no-untyped-def]  # fmt: skip
-    """scale * (dz - level - (rows - mean) * slope) of the rows present; 0 on padding."""
+def spread(  # type: ignore[no-untyped-def]
+    gradient, rows, output, present, mean, scale, level, slope, result, count, channels,
+    size: tl.constexpr, block: tl.constexpr,
+):  # fmt: skip
+    """Write scale * (dz - level - (rows - mean) * slope) of the rows present; 0 on padding."""
     row = tl.program_id(0).to(tl.int64) * size + tl.arange(0, size)
     channel = tl.arange(0, block)
     real = channel < channels
@@ -93,7 +98,7 @@ def normalized(rows: Tensor, present: Tensor, scale: Tensor, shift: Tensor, eps:
 def gradients(
     gradient: Tensor, rows: Tensor, output: Tensor, present: Tensor, mean: Tensor, inverse: Tensor, scale: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients of rows [P, C], scale and shift [C] from that of the output [P, C]; ``inverse`` is 1 / deviation [C]."""
+    """Gradients of rows [P, C], scale and shift [C] from the output's [P, C]; ``inverse`` is 1 / deviation [C]."""
     d_shift, product = _sums(slopes, rows, gradient, rows, output, present, mean).float()
     count = present.sum()
     d_rows = torch.empty_like(rows)

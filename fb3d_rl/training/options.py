@@ -56,8 +56,8 @@ class FlowFitOptions(OptimizerOptions):
     )
     graph: bool = option(
         True,
-        "on a GPU, launch a step's loss and gradients as one CUDA graph, with backbone=delayed; the order of sums is then "
-        "not always the same",
+        "on a GPU, launch a step's loss and gradients as one CUDA graph, with backbone=delayed; the order of sums then "
+        "varies",
     )
     evaluate_every: int | None = option(
         None, "from one validation to the next; null: only at the end", "steps", "[1, inf)"

@@ -17,6 +17,7 @@ from fb3d_rl.algos.flow_network import MET, SAMPLES, training_rows
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.run import run_training as run
 from fb3d_rl.algos.weights import BEST, CHECKPOINT, load_network
+from fb3d_rl.assets.catalog import Entry
 from fb3d_rl.data.generate import load_samples
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import evaluate
@@ -84,6 +85,28 @@ def test_training_starts_from_given_weights(tmp_path: Path, config: Config, weig
     with pytest.raises(UserError, match="no weights"):
         run(config("train", [*SMALL, "algo.start_from=nowhere.safetensors"]), tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_a_seed_of_the_fit_leaves_the_samples_alone(tmp_path: Path, config: Config) -> None:
+    for name, own in (("run", []), ("same", ["algo.seed=0"]), ("other", ["algo.seed=1"])):
+        run(config("train", [*SMALL, *own]), tmp_path / name)
+    points = [load_samples(tmp_path / name / SAMPLES)["observation", "points"] for name in ("run", "other")]
+    assert torch.equal(*points)
+    first, same, other = (load_checkpoint(tmp_path / name / CHECKPOINT) for name in ("run", "same", "other"))
+    weight = "network.fp1.layers.0.linear.weight"
+    assert torch.equal(first["state"]["model"][weight], same["state"]["model"][weight])
+    assert not torch.equal(first["state"]["model"][weight], other["state"]["model"][weight])
+    assert (first["seed"], other["seed"]) == (0, 1)
+
+
+def test_given_objects_have_their_share_of_the_samples() -> None:
+    entries = [Entry(Path(f"/objects/{name}"), "Box", "train_train") for name in ("a", "b", *map(str, range(12)))]
+    split = setup.TrainEntries(entries, [], [], frozenset(map(str, range(12))))
+    assert split.drawn(None) == entries
+    for share, times in ((0.5, 6), (0.75, 18), (0.01, 1)):
+        drawn = split.drawn(share)
+        assert [drawn.count(entry) for entry in entries] == [times] * 2 + [1] * 12
+    assert setup.TrainEntries(entries, [], []).drawn(0.5) == entries  # none is procedural
 
 
 def test_a_checkpoint_that_does_not_fit_is_named_before_any_work(tmp_path: Path, config: Config, weights: Path) -> None:

@@ -53,6 +53,14 @@ def test_rows_keep_the_contract_and_objects_take_turns(tmp_path: Path, folders: 
         assert int(row["target"]) == -1 or links[int(row["target"])].joint is not None
 
 
+def test_a_folder_that_is_listed_twice_is_drawn_twice_as_often(tmp_path: Path, folders: list[Path]) -> None:
+    rows = generate_samples(tmp_path / "s", [folders[0], folders[1], folders[0]], 12, 0, OPTIONS, 0)
+    assert torch.bincount(rows["object"]).tolist() == [8, 4]
+    for row in rows:
+        assert int(row["target"]) < len(load_object(folders[int(row["object"])]).links)
+    assert not torch.equal(rows[0]["observation", "points"], rows[1]["observation", "points"])
+
+
 def test_rows_follow_from_the_seed(tmp_path: Path, folders: list[Path]) -> None:
     first, again = draw(tmp_path / "a", folders), draw(tmp_path / "b", folders)
     other = draw(tmp_path / "c", folders, seed=1)

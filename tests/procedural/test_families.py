@@ -445,3 +445,10 @@ def test_simulator_loads_them(folder: Path) -> None:
         limits = np.array([joint.limits[0] for joint in articulation.active_joints])
         np.testing.assert_allclose(limits, [link.limits for link in movable], atol=1e-5)
         assert len(articulation.links) == len(movable) + 2
+
+
+@pytest.mark.parametrize("family", expand(["all", "mechanisms", "AmbiguousDoor"]))
+def test_many_objects_of_a_family_can_be_described(family: str) -> None:
+    """What is rare is among them, such as four trays in a low body."""
+    for index in range(300):
+        sample(family, 1, index)

@@ -82,3 +82,11 @@ def test_what_can_go_either_way_is_learned_as_two_answers_with_their_probabiliti
         optimizer.step()
     assert flows[0, 0] > 0.8 and flows[1, 0] < -0.7
     assert scores.softmax(0)[0].item() == pytest.approx(0.75, abs=0.02)
+
+
+def test_links_beyond_the_table_count_as_its_last_and_nothing_fails() -> None:
+    found, target, valid, link = drawn(3)
+    assert hypotheses_loss(found, target, valid, link + 10_000).isfinite()
+    # As many parts as there are links in sight, whatever their numbers.
+    expected = hypotheses_loss(found, target, valid, link)
+    torch.testing.assert_close(hypotheses_loss(found, target, valid, link * 100), expected)
