@@ -105,7 +105,7 @@ def followed(
             return joint
         if not leader.movable or multiplier == 0.0:
             say(f"joint {joint.name}: mimics {leader.name} without ever moving; fixed at {offset:g}")
-            return _held(joint, offset)
+            return held(joint, offset)
         say(f"joint {joint.name}: moves along with {leader.name} (mimic, {multiplier:g} times it plus {offset:g})")
         return replace(joint, mimic=Mimic(leader.name, multiplier, offset))
 
@@ -115,7 +115,7 @@ def followed(
     }
 
 
-def _held(joint: Joint, position: float) -> Joint:
+def held(joint: Joint, position: float) -> Joint:
     """The joint as a fixed one at a position (rad or m)."""
     return replace(
         joint, type="fixed", origin=joint.origin @ joint.motion(position), axis=0.0 * joint.axis,

@@ -28,7 +28,7 @@ def test_files_are_imported_as_folders_and_what_was_changed_is_said(tmp_path: Pa
     assert load_object(tmp_path / "out/large").category == "Safe"
     again = launch("objects.py", *arguments, cwd=tmp_path)
     assert again.returncode == 2 and "exists already" in again.stderr
-    put(tmp_path / "broken.urdf", "<mujoco/>")
+    put(tmp_path / "broken.urdf", "<sdf/>")
     broken = launch("objects.py", "import", "broken.urdf", "in/small.urdf", "--out", "two", cwd=tmp_path)
     assert broken.returncode == 1 and "no URDF" in " ".join(broken.stdout.split())
     assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["small"]
