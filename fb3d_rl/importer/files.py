@@ -83,9 +83,9 @@ def find_files(
         for path in [root] if root.is_file() else _whole(list(_descriptions(root, DEPTH))):
             folders = path.resolve().parents if root.is_dir() else ()
             inside = [folder for folder in folders if folder.is_relative_to(root.resolve())]
-            found.setdefault(
-                path.resolve(), Source(path, _name(path), _category(path), (*_package(path, inside), *further), body)
-            )
+            # MJCF has no packages, but its paths climb: all that was named may be read.
+            shared = inside[-1:] if root_of(path) == b"mujoco" else _package(path, inside)
+            found.setdefault(path.resolve(), Source(path, _name(path), _category(path), (*shared, *further), body))
     if not found:
         where = ", ".join(map(str, named)) or "an empty list"
         raise UserError(f"no object is described in {where}; expected files such as NAME.urdf or NAME.xml")
@@ -113,8 +113,9 @@ def _whole(paths: Sequence[Path]) -> list[Path]:
     parts: set[Path] = set()
     for path in paths:
         if root_of(path) == b"mujoco" and path.stat().st_size <= LARGEST_TEXT:
-            parts |= {(path.parent / os.fsdecode(name)).resolve() for name in INCLUDE.findall(path.read_bytes())}
-    return [path for path in paths if path.resolve() not in parts]
+            names = INCLUDE.findall(COMMENT.sub(b"", path.read_bytes()).replace(b"\\", b"/"))
+            parts |= {(path.parent / os.fsdecode(name)).resolve() for name in names}
+    return [path for path in paths if path.resolve() not in parts] or list(paths)
 
 
 def root_of(path: Path) -> bytes:

@@ -6,7 +6,7 @@ docs/objects.md lists the rules. The text is made safe before (:mod:`fb3d_rl.imp
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -107,27 +107,26 @@ class MjcfReader:
     def links(self) -> list[Link]:
         """The links of the file, or of the body that was asked for, with the limits of the file."""
         model, first = self.model, self.body()
+        taken = {first}
+        for body in range(first + 1, model.nbody):  # parents have smaller numbers
+            if model.body_parentid[body] in taken:
+                taken.add(body)
         names = _named([model.body(i).name for i in range(model.nbody)], "body")
-        joints = self.joints(names)
+        joints = self.joints(names, taken)
         links = [Link("world", "", -1, None, *(self.shapes(0, np.eye(4)) if first == 0 else ((), ())))]
         stands = [(0, np.eye(4))]  # of each body: its last link, T_link_body
-        taken = {first}
         for body in range(1, model.nbody):
             parent, pose = stands[model.body_parentid[body]]
             pose = pose @ self.pose(model.body_pos[body], model.body_quat[body])
-            if body == first or model.body_parentid[body] in taken:
-                taken.add(body)
-                moving = joints.get(body, [])
-                for number, (joint, anchor) in enumerate(moving, 1):
-                    # Each joint turns what the next ones carry; only the last link has shapes.
-                    name = names[body] if number == len(moving) else f"{names[body]}:{number}"
-                    origin = pose @ _moved(anchor) @ joint.origin
-                    pose = _moved(-anchor)
-                    visuals, collisions = self.shapes(body, pose) if number == len(moving) else ((), ())
-                    links.append(
-                        Link(name, part_name(name), parent, replace(joint, origin=origin), visuals, collisions)
-                    )
-                    parent = len(links) - 1
+            for number, (joint, anchor) in enumerate(joints.get(body, []), 1):
+                # Each joint moves what the next ones carry; only the last link has shapes.
+                last = number == len(joints[body])
+                name = names[body] if last else f"{names[body]}:{number}"
+                origin = pose @ _moved(anchor) @ joint.origin
+                pose = _moved(-anchor)
+                visuals, collisions = self.shapes(body, pose) if last else ((), ())
+                links.append(Link(name, part_name(name), parent, replace(joint, origin=origin), visuals, collisions))
+                parent = len(links) - 1
             stands.append((parent, pose))
         return links
 
@@ -153,18 +152,22 @@ class MjcfReader:
             )
         return names.index(self.source.body)
 
-    def joints(self, bodies: Sequence[str]) -> dict[int, list[tuple[Joint, NDArray[np.float64]]]]:
-        """Body -> its joints in the order in which they move it, each with its anchor [3] in the body's frame.
+    def joints(
+        self, bodies: Sequence[str], taken: Collection[int]
+    ) -> dict[int, list[tuple[Joint, NDArray[np.float64]]]]:
+        """Body of those taken -> its joints in the order in which they move it, each with its anchor [3] in its frame.
 
         A body that does not move has a fixed one. Positions count from where the file shows the model.
         """
         model = self.model
         names = _named([model.joint(j).name for j in range(model.njnt)], "joint")
-        follows = self.equalities(names)
+        follows = self.equalities(names, taken)
         found: dict[str, tuple[str, Joint]] = {}
         places: dict[int, list[tuple[str, NDArray[np.float64]]]] = {}
         for j, name in enumerate(names):
             kind = self.kind("Joint", model.jnt_type[j])
+            if model.jnt_bodyid[j] not in taken:
+                continue
             if kind not in TYPES:
                 self.dropped.append(f"joint {name}: {kind}, read as fixed")
                 continue
@@ -182,18 +185,18 @@ class MjcfReader:
             places.setdefault(int(model.jnt_bodyid[j]), []).append((name, np.array(model.jnt_pos[j])))
         found = followed(found, self.fail, self.dropped.append)
         moving = {body: [(found[name][1], anchor) for name, anchor in at] for body, at in places.items()}
-        for body in range(1, model.nbody):
+        for body in set(taken) - {0}:
             fixed = Joint(f"{bodies[body]}:fixed", "fixed", np.eye(4), np.zeros(3), (0.0, 0.0))
             moving.setdefault(body, [(fixed, np.zeros(3))])
         return moving
 
-    def equalities(self, names: Sequence[str]) -> dict[str, Mimic]:
+    def equalities(self, names: Sequence[str], taken: Collection[int]) -> dict[str, Mimic]:
         """Joint -> the one that it follows, "" for none; MuJoCo counts both from where the file shows the model."""
         model, found = self.model, dict[str, Mimic]()
         for e in range(model.neq):
             one, other = (int(ids[e]) for ids in (model.eq_obj1id, model.eq_obj2id))
             offset, factor, *powers = (float(value) for value in model.eq_data[e, :5])
-            if self.kind("Eq", model.eq_type[e]) != "joint" or not model.eq_active0[e]:
+            if not model.eq_active0[e] or model.jnt_bodyid[one] not in taken:
                 continue
             if any(powers) or names[one] in found:
                 self.dropped.append(f"joint {names[one]}: an equality that is not linear or not the first is not read")
@@ -231,7 +234,7 @@ class MjcfReader:
     def surface(self, geom: int, pose: NDArray[np.float64]) -> Mesh:
         """The mesh of a geom, moved by T_link_geom [4, 4]."""
         model, kind, size = self.model, self.kind("Geom", self.model.geom_type[geom]), self.model.geom_size[geom]
-        if kind == "mesh":
+        if kind in ("mesh", "sdf"):
             of = model.geom_dataid[geom]
             vertices = model.mesh_vert[model.mesh_vertadr[of] :][: model.mesh_vertnum[of]].astype(np.float64)
             faces = model.mesh_face[model.mesh_faceadr[of] :][: model.mesh_facenum[of]].astype(np.int64)

@@ -8,6 +8,7 @@ left out or refused before.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -52,7 +53,7 @@ NUMBERS = itertools.count()
 content again though it has another ``refpos``."""
 
 DEEPEST = 90
-MOST_SHAPES = 10_000
+MOST_ELEMENTS = 10_000
 
 
 @dataclass
@@ -77,7 +78,10 @@ class Text:
         """The largest number in its Euler angles and axis-angles."""
         words = [word for element in self.root.iter() for word in element.get("euler", "").split()]
         words += [word for element in self.root.iter() for word in element.get("axisangle", "").split()[3:]]
-        return max((abs(float(word)) for word in words), default=0.0)
+        try:
+            return max((abs(float(word)) for word in words), default=0.0)
+        except ValueError:  # MuJoCo reads other spellings, too
+            return math.inf
 
     def xml(self, angle: str | None = None) -> str:
         """The document, with a unit of angles if it is given."""
@@ -109,7 +113,7 @@ class Composer:
         self.source, self.fail, self.say, self.lose = source, fail, say, lose
         self.files = MeshFiles(source.path.parent, source.packages, fail, say)
         self.seen = {source.path.resolve()}
-        self.bytes = 0
+        self.bytes = self.mesh_bytes = 0
 
     def compose(self) -> Text:
         """The document.
@@ -141,18 +145,18 @@ class Composer:
         """Replace the includes below an element, a ``tag``, by what they mean, and take out what is not read."""
         if depth > DEEPEST:
             self.fail(f"its elements are nested more than {DEEPEST} deep")
-        children = list(element)
-        for child in children:
-            element.remove(child)
+        kept: list[Element] = []
+        for child in element:
             if child.tag == "include":
-                element.extend(self._included(child, tag, folder, depth))
+                kept += self._included(child, tag, folder, depth)
             elif self._kept(tag, child):
-                element.append(child)
+                kept.append(child)
                 self._expand(child, child.tag, folder, depth + 1)
+        element[:] = kept
 
     def _included(self, include: Element, tag: str, folder: Path, depth: int) -> list[Element]:
         """What an include means, below an element ``tag``."""
-        name = include.get("file") or self.fail("an <include> has no attribute 'file'")
+        name = (include.get("file") or self.fail("an <include> has no attribute 'file'")).replace("\\", "/")
         # MuJoCo looks beside the main file first, then beside the file that includes.
         beside = not (self.source.path.parent / name).is_file() and (folder / name).is_file()
         path = self.files.find(str(folder / name) if beside else name, "include", SUFFIXES).resolve()
@@ -171,7 +175,8 @@ class Composer:
         if tag in REFUSED:
             self.fail(f"it has a <{tag}>, whose geometry cannot be read; save the model without it")
         if parent == "equality" and tag != "joint":
-            self.say(f"equality {child.get('name') or tag}: a <{tag}>, not read; its ends move by themselves")
+            if self.source.body is None:  # else it may be one of a robot
+                self.say(f"equality {child.get('name') or tag}: a <{tag}>, not read; its ends move by themselves")
             return False
         if tag == "geom" and "hfield" in (child.get("type"), *child.attrib):
             self.lose(f"geom {child.get('name') or child.get('hfield')}: a height field in place of a mesh")
@@ -185,16 +190,18 @@ class Composer:
         return True
 
     def _bound(self, element: Element, times: int, counts: list[int]) -> None:
-        """Refuse documents with too many bodies or shapes; ``times`` is how often the element is replicated."""
+        """Refuse documents of too many elements; ``times`` is how often this one is replicated, ``counts`` goes on."""
         for child in element:
             number = times
             if child.tag == "replicate":
-                text = child.get("count", "")
-                number *= int(text) if text.strip().isdecimal() else self.fail(f"a <replicate> has count={text!r}")
+                text = child.get("count", "").strip()
+                if not (text.isdecimal() and len(text) < 12):
+                    self.fail(f"a <replicate> has count={text[:20]!r}")
+                number *= int(text)
             counts[0] += number * (child.tag == "body")
-            counts[1] += number * (child.tag == "geom")
-            if counts[0] >= MOST_LINKS or counts[1] > MOST_SHAPES:
-                self.fail(f"its bodies or geoms are more than the {MOST_LINKS - 1} or {MOST_SHAPES} that are read")
+            counts[1] += number
+            if counts[0] >= MOST_LINKS or counts[1] > MOST_ELEMENTS:
+                self.fail(f"it has more than the {MOST_LINKS - 1} bodies or {MOST_ELEMENTS} elements that are read")
             self._bound(child, number, counts)
 
     def _meshes(self, root: Element) -> dict[str, bytes]:
@@ -214,7 +221,8 @@ class Composer:
                 mesh.set("name", mesh.get("name") or Path(name.replace("\\", "/")).stem)
                 key = f"{next(NUMBERS)}{path.suffix.lower()}"
                 mesh.set("file", key)
-                assets[key] = path.read_bytes()
-                if sum(map(len, assets.values())) > LARGEST_OBJECT:
+                self.mesh_bytes += path.stat().st_size
+                if self.mesh_bytes > LARGEST_OBJECT:
                     self.fail(f"its meshes have more than the {LARGEST_OBJECT / 2**20:.0f} MiB that are read")
+                assets[key] = path.read_bytes()
         return assets

@@ -95,6 +95,8 @@ SAME = {
     "stl": (mjcf(OF_MESH, head=RADIAN + MESH.format("a.stl", "")), urdf(FILE)),
     "mesh named after its file": (
         mjcf('<geom type="mesh" mesh="a"/>', head=RADIAN + '<asset><mesh file="a.obj"/></asset>'), urdf(FILE)),
+    "mesh as a distance field": (
+        mjcf('<geom type="sdf" mesh="m"/>', head=RADIAN + MESH.format("a.obj", "")), urdf(FILE)),
     "mirrored mesh": (
         mjcf(OF_MESH, head=RADIAN + MESH.format("a.obj", 'scale="2 -1 1"')),
         urdf(shape('<mesh filename="a.obj" scale="2 -1 1"/>'))),
@@ -311,13 +313,14 @@ def test_little_is_said_of_a_plain_file(tmp_path: Path) -> None:
 
 ROOM = mjcf(
     at='pos="1 0 0" euler="0 0 .5"',
-    world='<geom size="9"/><body name="robot"><joint range="0 1"/><geom size="7"/></body>',
+    world='<geom size="3"/><body name="robot"><joint range="0 1"/><geom size="2"/></body>',
 )
 
 
 def test_one_body_of_a_room_is_taken_from_where_it_stands(tmp_path: Path) -> None:
     path = put(tmp_path, ROOM)
     assert any("robot, body stand side by side" in remark for remark in read(path).dropped)
+    assert not read(path, "robot").dropped and not any("robot" in remark for remark in read(path, "body").dropped)
     assert_same(read(path, "body"), read(put(tmp_path / "b", urdf(origin='xyz="1 0 0" rpy="0 0 0.5"'), "a.urdf")))
     door = read(path, "door")  # with the joint that carries it
     assert [link.name for link in door.links] == ["world", "door"] and door.joint_of(1).limits == (0.0, 1.5)
@@ -419,6 +422,8 @@ BROKEN = {
     "too many copies": (mjcf('<replicate count="1000000000"><geom size="1"/></replicate>'), "more than"),
     "copies of copies": (
         mjcf('<replicate count="200"><replicate count="200"><geom size="1"/></replicate></replicate>'), "more than"),
+    "copies of nothing": (mjcf('<replicate count="100000000"/>'), "more than"),
+    "copies of a long number": (mjcf(f'<replicate count="{"9" * 5000}"/>'), "count='999"),
     "copies of no number": (mjcf('<replicate count="-1"><geom size="1"/></replicate>'), "count='-1'"),
     "too many bodies": (mjcf(more="<body/>" * 1000), "more than"),
     "too deep": (mjcf(more="<frame>" * 2000 + "</frame>" * 2000), "deep"),
