@@ -6,7 +6,9 @@ docs/objects.md lists the rules. The text is made safe before (:mod:`fb3d_rl.imp
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+import os
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NoReturn
 
@@ -28,6 +30,9 @@ EXTRA = "mujoco"
 
 TYPES: dict[str, JointType] = {"hinge": "revolute", "slide": "prismatic"}
 """The joints of one degree of freedom; those of several are read as fixed."""
+
+BOUNDED = ("body_pos", "body_quat", "geom_pos", "geom_quat", "jnt_pos", "jnt_axis", "qpos0", "eq_data")
+"""Arrays of the compiled model of which no value may be beyond measure."""
 
 SHOWN = 3
 """MuJoCo draws the geoms of the groups below unless it is told otherwise."""
@@ -74,6 +79,10 @@ class MjcfReader:
             ) from error
         self.mujoco: Any = mujoco
         self.model = self.compiled(text)
+        for key in BOUNDED:
+            values = abs(getattr(self.model, key))
+            if not (values <= FARTHEST).all():
+                self.fail(f"it compiles to a {key} of {values.max():.3g}, where {FARTHEST:g} is the most that is read")
         links = limited(self.links(), self.dropped.append)
         lost = tuple(dict.fromkeys(self.lost))
         return links, (*lost, *dict.fromkeys(self.dropped)), lost
@@ -94,8 +103,9 @@ class MjcfReader:
         # MuJoCo's own way is to write warnings into a file of the working folder.
         self.mujoco.set_mju_user_warning(self.dropped.append)
         try:
-            return self.mujoco.MjModel.from_xml_string(xml, text.assets)
-        except (ValueError, self.mujoco.FatalError) as error:
+            with _quiet():
+                return self.mujoco.MjModel.from_xml_string(xml, text.assets)
+        except (ValueError, RuntimeError, self.mujoco.FatalError) as error:
             self.fail(f"MuJoCo cannot compile it ({' '.join(str(error).split())})")
         finally:
             self.mujoco.set_mju_user_warning(None)
@@ -117,7 +127,7 @@ class MjcfReader:
         stands = [(0, np.eye(4))]  # of each body: its last link, T_link_body
         for body in range(1, model.nbody):
             parent, pose = stands[model.body_parentid[body]]
-            pose = pose @ self.pose(model.body_pos[body], model.body_quat[body])
+            pose = pose @ _pose(model.body_pos[body], model.body_quat[body])
             for number, (joint, anchor) in enumerate(joints.get(body, []), 1):
                 # Each joint moves what the next ones carry; only the last link has shapes.
                 last = number == len(joints[body])
@@ -222,7 +232,7 @@ class MjcfReader:
             if self.kind("Geom", model.geom_type[geom]) == "plane":
                 self.dropped.append(f"geom {model.geom(geom).name or f'of {name}'}: a plane, left out")
                 continue
-            mesh = self.surface(geom, pose @ self.pose(model.geom_pos[geom], model.geom_quat[geom]))
+            mesh = self.surface(geom, pose @ _pose(model.geom_pos[geom], model.geom_quat[geom]))
             touches = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
             touched += [mesh] * touches
             if model.geom_rgba[geom, 3] > 0 and model.geom_group[geom] < SHOWN:
@@ -249,13 +259,29 @@ class MjcfReader:
             self.fail(f"a {kind} reaches {abs(mesh.vertices).max():.3g} m from its body")
         return mesh
 
-    def pose(self, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """T [4, 4] of a position [3] and a quaternion [4] (w first)."""
-        transform = _moved(position)
-        if not (abs(position).max() <= FARTHEST and np.isfinite(quaternion).all()):
-            self.fail(f"a body or geom lies {abs(position).max():.3g} m away")
-        transform[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
-        return transform
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep standard error clean: MuJoCo's Qhull writes pages there about a flat mesh, besides the error that it is."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # there is none
+        yield
+        return
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+
+
+def _pose(position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """T [4, 4] of a position [3] and a quaternion [4] (w first)."""
+    transform = _moved(position)
+    transform[:3, :3] = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    return transform
 
 
 def _moved(position: NDArray[np.float64]) -> NDArray[np.float64]:

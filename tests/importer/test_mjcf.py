@@ -389,6 +389,7 @@ BROKEN = {
     "mesh of another kind": (assets('<mesh file="a.step"/>'), "no .obj, .stl or .msh"),
     "broken obj": (assets('<mesh file="broken.obj"/>'), "MuJoCo cannot compile it"),
     "broken stl": (assets('<mesh file="broken.stl"/>'), "MuJoCo cannot compile it"),
+    "a flat mesh": (mjcf(OF_MESH, head=f'{RADIAN}<asset><mesh name="m" file="flat.obj"/></asset>'), "MuJoCo"),
     "half an stl": (assets('<mesh file="half.stl"/>'), "MuJoCo cannot compile it"),
     "mesh of no name": (mjcf(OF_MESH), "MuJoCo cannot compile it"),
     "include outside": (including("../secret.xml"), "the include path '../secret.xml' leaves"),
@@ -412,7 +413,10 @@ BROKEN = {
     "no size": (mjcf('<geom type="box"/>'), "size"),
     "size of no number": (mjcf('<geom size="nan"/>'), "size"),
     "size beyond measure": (mjcf('<geom size="1e9"/>'), "size 1e"),
-    "far away": (mjcf(at='pos="1e9 0 0"'), "1e.09 m away"),
+    "far away": (mjcf(at='pos="1e9 0 0"'), "body_pos of 1e"),
+    "an equality of no number": (
+        mjcf().replace("</mujoco>", '<equality><joint joint1="hinge" polycoef="nan 1 0 0 0"/></equality></mujoco>'),
+        "eq_data of nan"),
     "axis of no length": (mjcf(hinge='<joint name="hinge" axis="0 0 0" range="0 1"/>'), "axis"),
     "range upside down": (mjcf(hinge='<joint name="hinge" range="1 0" limited="true"/>'), "range"),
     "one name twice": (mjcf(more='<body name="door"/>'), "repeated name"),
@@ -439,7 +443,7 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_what_cannot_be_read_ends_in_one_sentence(tmp_path: Path, case: str) -> None:
+def test_what_cannot_be_read_ends_in_one_sentence(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]) -> None:
     text, word = BROKEN[case]
     path = put(tmp_path / "a17", text)
     (tmp_path / "secret.obj").write_bytes(FILES["a.obj"])
@@ -449,6 +453,7 @@ def test_what_cannot_be_read_ends_in_one_sentence(tmp_path: Path, case: str) -> 
     (path.parent / "up").symlink_to(tmp_path, target_is_directory=True)
     (path.parent / "broken.obj").write_text("v 0 0 0\nv 1 0 0\nf 1 2 9\n")
     (path.parent / "broken.stl").write_bytes(b"\xff" * 500)
+    (path.parent / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
     (path.parent / "half.stl").write_bytes(FILES["a.stl"][:200])
     (path.parent / "sub/circle.xml").write_text('<mujocoinclude><include file="circle.xml"/></mujocoinclude>')
     (path.parent / "sub/entity.xml").write_text('<!DOCTYPE m [<!ENTITY e "x">]><m>&e;</m>')
@@ -459,6 +464,7 @@ def test_what_cannot_be_read_ends_in_one_sentence(tmp_path: Path, case: str) -> 
         read(path)
     assert "a17" in str(caught.value) or "object a" in str(caught.value)
     assert "\n" not in str(caught.value) and sorted(tmp_path.rglob("*")) == before
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_package_that_was_named_is_read(tmp_path: Path) -> None:
