@@ -1,14 +1,15 @@
 """Make procedural objects; import, unpack, list, validate, preview and compare objects.
 
 python launch/objects.py generate --out DIR [--categories all|train|test|mechanisms|NAME,...] [--count 50] [--seed 0]
-python launch/objects.py import PATH... --out DIR [--category NAME] [--package DIR] [--scale mm] [--up y] [--front -y]
+python launch/objects.py import PATH... --out DIR [--category NAME] [--package DIR] [--body NAME] [--scale mm] [--up y]
+                                [--front -y]
 python launch/objects.py unpack ARCHIVE --out DIR
 python launch/objects.py list PATH [--split SPLIT]
 python launch/objects.py validate PATH [--out FILE.json] [--workers N]
 python launch/objects.py preview PATH --out FILE.png|html [--split SPLIT] [--each N]
 python launch/objects.py compare DIR OTHER [--out FILE.json] [--workers N]
 
-PATH is a folder of PartNet-Mobility objects, a file such as a URDF, or a folder of such files.
+PATH is a folder of PartNet-Mobility objects, a file such as a URDF or MJCF, or a folder of such files.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--count", type=int, default=50, help="objects of each category (default: 50)")
     make.add_argument("--seed", type=int, default=0)
 
-    says = "import objects from files of other makers, such as URDFs, as PartNet-Mobility folders DIR/<id>"
+    says = "import objects from files of other makers, such as URDFs and MJCFs, as PartNet-Mobility folders DIR/<id>"
     take = commands.add_parser("import", help=says, description=says)
     take.add_argument("paths", nargs="+", metavar="PATH", help="a file, or a folder of files")
     take.add_argument("--out", type=Path, required=True, metavar="DIR")
@@ -78,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     take.add_argument(
         "--package", action="append", default=[], metavar="DIR", help="a folder that package://NAME/ means"
     )
+    take.add_argument("--body", metavar="NAME", help="of MJCFs take this body and what it carries (default: all)")
     take.add_argument(
         "--scale",
         default="auto",
@@ -169,7 +171,7 @@ def take(options: argparse.Namespace) -> int:
     from fb3d_rl.kinematics.opening import openable_links
 
     frame = frame_of(AssetsOptions(scale=options.scale, up=options.up, front=options.front))
-    sources = find_files(options.paths, options.package)
+    sources = find_files(options.paths, options.package, options.body)
     taken = [source.id for source in sources if (options.out / source.id).exists()]
     if taken:
         raise UserError(f"{options.out / taken[0]} exists already; choose another --out or remove it")

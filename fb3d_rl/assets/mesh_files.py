@@ -61,8 +61,13 @@ class MeshFiles:
             self.read[path] = self._load(path, filename)
         return self.read[path]
 
-    def find(self, filename: str) -> Path:
+    def find(self, filename: str, what: str = "mesh", kinds: Sequence[str] = MESHES) -> Path:
         """The file that a name means: a path, or an address such as package://NAME/PATH or file:///PATH.
+
+        Args:
+            filename: the name.
+            what: what messages call the file.
+            kinds: the suffixes that it may have.
 
         Raises:
             UserError: as in :meth:`surface`.
@@ -78,17 +83,17 @@ class MeshFiles:
                     found = path
                     break
         except (OSError, ValueError, RuntimeError) as error:  # a name that no file can have, or links in a circle
-            self.fail(f"the mesh path {filename!r} cannot be followed ({error})")
+            self.fail(f"the {what} path {filename!r} cannot be followed ({error})")
         if found is None and left:
             self.fail(
-                f"the mesh path {filename!r} leaves the object's folder {self.folder}; copy the file into it, or name "
-                "the package's folder: assets.packages=[DIR]"
+                f"the {what} path {filename!r} leaves the object's folder {self.folder}; copy the file into it, or "
+                "name the package's folder: assets.packages=[DIR]"
             )
-        if (found or Path(filename)).suffix.lower() not in MESHES:
-            self.fail(f"the mesh {filename} is no {', '.join(MESHES[:-1])} or {MESHES[-1]} file")
+        if (found or Path(filename)).suffix.lower() not in kinds:
+            self.fail(f"the {what} {filename} is no {', '.join(kinds[:-1])} or {kinds[-1]} file")
         if found is None:
             hint = "; a package of another folder is to be named: assets.packages=[DIR]" if "://" in filename else ""
-            self.fail(f"the mesh {filename} is missing in {self.folder}{hint}")
+            self.fail(f"the {what} {filename} is missing in {self.folder}{hint}")
         return found
 
     def _places(self, name: str) -> Iterator[Path]:
@@ -99,7 +104,7 @@ class MeshFiles:
             yield from (self.folder / text.removeprefix("localhost") for text in spellings)
             return
         if scheme not in ("package", "model"):
-            self.fail(f"the mesh {name} is no file of this machine; download it into the object's folder")
+            self.fail(f"{name} is no file of this machine; download it into the object's folder")
         split = [text.partition("/")[::2] for text in spellings]
         for package, path in split:
             yield from (root / path.lstrip("/") for root in self.roots if root.name == package)

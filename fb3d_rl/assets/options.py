@@ -55,6 +55,9 @@ class AssetsOptions:
         within="[0, 1)",
     )
     packages: list[str] = option([], "files: folders that package://NAME/... may mean, besides the object's own")
+    body: str | None = option(
+        None, "files: the body of an MJCF that is taken, with all that it carries", null="all bodies of the file"
+    )
     scale: Any = option(
         "auto",
         "files: their unit, m, mm, cm, inch or the metres in one; auto recognises what is larger than 20 m by its size",

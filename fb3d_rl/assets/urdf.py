@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 from xml.etree.ElementTree import ParseError
@@ -25,7 +24,8 @@ from scipy.spatial.transform import Rotation
 from fb3d_rl.assets.articulation import Joint, JointType, Link, Mesh, Mimic
 from fb3d_rl.assets.cache import Parsed
 from fb3d_rl.assets.mesh_files import MeshFiles
-from fb3d_rl.assets.urdf_joints import FARTHEST, FASTENED, bounded, followed, led, sensible
+from fb3d_rl.assets.shapes import completed, each_once, solid
+from fb3d_rl.assets.urdf_joints import FARTHEST, FASTENED, followed, limited
 from fb3d_rl.errors import UserError
 
 if TYPE_CHECKING:
@@ -150,16 +150,9 @@ class UrdfReader:
                 visuals=visuals,
                 collisions=collisions,
             )
-        found = led(map(self.limited, links.values(), [list(links.values())] * len(links)))
+        found = limited(list(links.values()), self.dropped.append)
         lost = tuple(dict.fromkeys(self.lost))
         return found, (*lost, *dict.fromkeys(self.dropped)), lost
-
-    def limited(self, link: Link, links: Sequence[Link]) -> Link:
-        """The link with usable limits of its joint."""
-        if link.joint is None or link.joint.mimic or link.joint.type not in ("revolute", "prismatic"):
-            return link
-        joint, say = sensible(link.joint, self.dropped.append), self.dropped.append
-        return replace(link, joint=bounded(joint, lambda: _length(links, links.index(link), joint.axis), say))
 
     def joined(self, links: dict[str, Element], joints: dict[str, tuple[str, Joint]]) -> list[str]:
         """The names of the links, without those that hold nothing and that no joint joins, such as a "world"."""
@@ -271,11 +264,7 @@ class UrdfReader:
     def surfaces(self, link: Element) -> tuple[tuple[Mesh, ...], tuple[Mesh, ...]]:
         """The meshes of a link that are seen and those that are touched; where it lacks one kind, the other's."""
         visuals, collisions = self.shapes(link, "visual"), self.shapes(link, "collision")
-        if visuals and not collisions:
-            self.dropped.append(f"link {link.get('name')}: no collision, so its visual is touched too")
-        elif collisions and not visuals:
-            self.dropped.append(f"link {link.get('name')}: no visual, so its collision is seen too")
-        return visuals or collisions, collisions or visuals
+        return completed(str(link.get("name")), visuals, collisions, self.dropped.append)
 
     def shapes(self, link: Element, tag: str) -> tuple[Mesh, ...]:
         """The meshes of a link's ``<visual>`` or ``<collision>`` elements; shapes of unknown kinds are lost."""
@@ -304,14 +293,7 @@ class UrdfReader:
         )
         if not (size > 0).all() or size.max() > FARTHEST:
             self.fail(f"a <{shape.tag}> has the size {' '.join(f'{value:g}' for value in size)}")
-        if shape.tag == "box":
-            solid = trimesh.creation.box(size)
-        elif shape.tag == "sphere":
-            solid = trimesh.creation.icosphere(radius=size[0])
-        else:
-            solid = getattr(trimesh.creation, shape.tag)(radius=size[0], height=size[1])
-        vertices = np.asarray(solid.vertices, dtype=np.float64) - np.mean(solid.bounds, axis=0)
-        return Mesh(vertices @ transform[:3, :3].T + transform[:3, 3], np.asarray(solid.faces, dtype=np.int64))
+        return solid(shape.tag, size, transform)
 
     def meshes(self, mesh: Element, transform: NDArray[np.float64], tag: str) -> list[Mesh]:
         """The meshes of a ``<mesh>``: none if it has no surface, several of a decomposed part."""
@@ -347,7 +329,7 @@ class UrdfReader:
                     self.lost.append(f"{filename}: no surface")
                     faces = faces[:0]
                 if seen and len(faces):
-                    vertices, faces = _each_once(vertices, faces)
+                    vertices, faces = each_once(vertices, faces)
                 moved = (vertices * scale) @ transform[:3, :3].T + transform[:3, 3]
             if len(faces) and not abs(moved).max() <= FARTHEST:
                 self.fail(f"the mesh {filename} reaches {abs(moved).max():.3g} m from its link")
@@ -372,27 +354,3 @@ class UrdfReader:
     def semantics(self) -> dict[str, str]:
         """Link name -> semantic name; a URDF alone names nothing."""
         return {}
-
-
-def _each_once(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The same surface without repeats.
-
-    PartNet's files hold a point for each corner and triangles for each side; a fifth of the points and half of the
-    triangles are left.
-    """
-    first, number = trimesh.grouping.unique_rows(vertices, keep_order=True)
-    faces = number[faces]
-    return vertices[first], faces[np.sort(trimesh.grouping.unique_rows(np.sort(faces, axis=1))[0])]
-
-
-def _length(links: Sequence[Link], link: int, axis: NDArray[np.float64]) -> float:
-    """The length (m) along an axis [3] of a link with all that is fixed to it; 0 if none of them has a mesh."""
-    placed, along = {link: np.eye(4)}, []
-    for i, part in enumerate(links):
-        if part.parent in placed and part.joint is not None and not part.joint.movable:
-            placed[i] = placed[part.parent] @ part.joint.origin
-        if i in placed:
-            along += [(mesh.vertices @ placed[i][:3, :3].T + placed[i][:3, 3]) @ axis for mesh in part.visuals]
-    return float(np.ptp(np.concatenate(along))) if along else 0.0

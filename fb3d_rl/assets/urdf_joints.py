@@ -1,11 +1,14 @@
-"""The joints of a URDF as people write them: defaults of what is missing, degrees, joints that follow others."""
+"""The joints of a description as people write them: defaults of what is missing, degrees, joints that follow others."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fb3d_rl.assets.articulation import Joint, Link, Mimic
 
@@ -102,7 +105,7 @@ def followed(
             return joint
         if not leader.movable or multiplier == 0.0:
             say(f"joint {joint.name}: mimics {leader.name} without ever moving; fixed at {offset:g}")
-            return _held(joint, offset)
+            return held(joint, offset)
         say(f"joint {joint.name}: moves along with {leader.name} (mimic, {multiplier:g} times it plus {offset:g})")
         return replace(joint, mimic=Mimic(leader.name, multiplier, offset))
 
@@ -112,12 +115,40 @@ def followed(
     }
 
 
-def _held(joint: Joint, position: float) -> Joint:
+def held(joint: Joint, position: float) -> Joint:
     """The joint as a fixed one at a position (rad or m)."""
     return replace(
         joint, type="fixed", origin=joint.origin @ joint.motion(position), axis=0.0 * joint.axis,
         limits=(0.0, 0.0), mimic=None,
     )  # fmt: skip
+
+
+def limited(links: Sequence[Link], say: Callable[[str], None]) -> tuple[Link, ...]:
+    """The links (parents first) with usable limits of their joints, which are those of the file before.
+
+    Args:
+        links: the links.
+        say: takes a remark.
+    """
+
+    def usable(i: int, link: Link) -> Link:
+        if link.joint is None or link.joint.mimic or link.joint.type not in ("revolute", "prismatic"):
+            return link
+        joint = sensible(link.joint, say)
+        return replace(link, joint=bounded(joint, lambda: _length(links, i, joint.axis), say))
+
+    return led(map(usable, range(len(links)), links))
+
+
+def _length(links: Sequence[Link], link: int, axis: NDArray[np.float64]) -> float:
+    """The length (m) along an axis [3] of a link with all that is fixed to it; 0 if none of them has a mesh."""
+    placed, along = {link: np.eye(4)}, []
+    for i, part in enumerate(links):
+        if part.parent in placed and part.joint is not None and not part.joint.movable:
+            placed[i] = placed[part.parent] @ part.joint.origin
+        if i in placed:
+            along += [(mesh.vertices @ placed[i][:3, :3].T + placed[i][:3, 3]) @ axis for mesh in part.visuals]
+    return float(np.ptp(np.concatenate(along))) if along else 0.0
 
 
 def led(links: Iterable[Link]) -> tuple[Link, ...]:

@@ -46,7 +46,7 @@ def files_catalog(
     Raises:
         UserError: there is no file, an unknown split, or no object that can be used.
     """
-    sources = {source.id: source for source in find_files(assets.paths, assets.packages)}
+    sources = {source.id: source for source in find_files(assets.paths, assets.packages, assets.body)}
     frame, category = frame_of(assets), assets.category
     table = read_split(assets.split_file or UMPNET_SPLIT)
     categories = {name: category or source.category for name, source in sources.items()}

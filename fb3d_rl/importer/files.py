@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from fb3d_rl.assets.folders import URDFS, find_urdf
+from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT
 from fb3d_rl.assets.splits import CATEGORIES
 from fb3d_rl.errors import UserError
 
-SUFFIXES = (".urdf", ".xml")
+SUFFIXES = (".urdf", ".xml", ".mjcf")
 """Of the files that are looked at in a folder; a file that is named by itself may have any."""
 
 HEAD = 8192
 """In so many bytes the root element of a description has to begin."""
 
-LAYOUT = ("urdf", "urdfs", "robots", "model", "models", "xml")
+LAYOUT = ("urdf", "urdfs", "robots", "model", "models", "xml", "mjcf")
 """Folders of a package (as in ROS) beside which its meshes lie; the package is the folder above."""
+
+KINDS = (b"robot", b"mujoco")
+"""Root elements of files that describe an object."""
+
+COMMENT = re.compile(rb"<!--.*?(?:-->|\Z)", re.DOTALL)
+
+INCLUDE = re.compile(rb"<include\s+file\s*=\s*[\"']([^\"']+)[\"']")
 
 DEPTH = 6
 """How many levels below a root files are searched for."""
@@ -34,12 +43,14 @@ class Source:
         id: the object's id: the file's name without its suffix, or the folder's for a PartNet-Mobility object.
         category: of UMPNet's 21, the one after which a folder above the file is named; else "unknown".
         packages: folders besides the file's own that its meshes may be in.
+        body: the body that is taken, with those that it carries, of an MJCF; None for all of them.
     """
 
     path: Path
     id: str
     category: str
     packages: tuple[Path, ...] = ()
+    body: str | None = None
 
     @property
     def partnet(self) -> bool:
@@ -47,12 +58,15 @@ class Source:
         return self.path.name in URDFS
 
 
-def find_files(roots: str | Path | Sequence[str | Path], packages: Sequence[str | Path] = ()) -> list[Source]:
+def find_files(
+    roots: str | Path | Sequence[str | Path], packages: Sequence[str | Path] = (), body: str | None = None
+) -> list[Source]:
     """The objects in files: each of ``roots`` is a file, or a folder in which they are looked for.
 
     Args:
         roots: a path, or several.
         packages: folders in which ``package://NAME/...`` is looked for.
+        body: the body that is taken of each.
 
     Raises:
         UserError: a path does not exist, or no description is found.
@@ -66,15 +80,15 @@ def find_files(roots: str | Path | Sequence[str | Path], packages: Sequence[str 
     for root in named:
         if not root.exists():
             raise UserError(f"{root} does not exist; give the file of an object or a folder of such files")
-        for path in [root] if root.is_file() else _descriptions(root, DEPTH):
+        for path in [root] if root.is_file() else _whole(list(_descriptions(root, DEPTH))):
             folders = path.resolve().parents if root.is_dir() else ()
             inside = [folder for folder in folders if folder.is_relative_to(root.resolve())]
-            found.setdefault(
-                path.resolve(), Source(path, _name(path), _category(path), (*_package(path, inside), *further))
-            )
+            # MJCF has no packages, but its paths climb: all that was named may be read.
+            shared = inside[-1:] if root_of(path) == b"mujoco" else _package(path, inside)
+            found.setdefault(path.resolve(), Source(path, _name(path), _category(path), (*shared, *further), body))
     if not found:
         where = ", ".join(map(str, named)) or "an empty list"
-        raise UserError(f"no object is described in {where}; expected files such as NAME.urdf")
+        raise UserError(f"no object is described in {where}; expected files such as NAME.urdf or NAME.xml")
     return _distinct(list(found.values()))
 
 
@@ -88,18 +102,30 @@ def _descriptions(folder: Path, depth: int) -> Iterator[Path]:
         if entry.name.startswith("."):
             continue
         if entry.is_file() and Path(entry.name).suffix.lower() in SUFFIXES:
-            if Path(entry.name).suffix.lower() == ".urdf" or b"<robot" in _head(Path(entry.path)):
+            if Path(entry.name).suffix.lower() == ".urdf" or root_of(Path(entry.path)) in KINDS:
                 yield Path(entry.path)
         elif depth and entry.is_dir():
             yield from _descriptions(Path(entry.path), depth - 1)
 
 
-def _head(path: Path) -> bytes:
+def _whole(paths: Sequence[Path]) -> list[Path]:
+    """The files without those that another one of them includes: parts of it, such as its meshes or a room."""
+    parts: set[Path] = set()
+    for path in paths:
+        if root_of(path) == b"mujoco" and path.stat().st_size <= LARGEST_TEXT:
+            names = INCLUDE.findall(COMMENT.sub(b"", path.read_bytes()).replace(b"\\", b"/"))
+            parts |= {(path.parent / os.fsdecode(name)).resolve() for name in names}
+    return [path for path in paths if path.resolve() not in parts] or list(paths)
+
+
+def root_of(path: Path) -> bytes:
+    """The root element of an XML file, by its head; b"" if there is none."""
     try:
         with path.open("rb") as stream:
-            return stream.read(HEAD)
+            found = re.search(rb"<([\w.:-]+)", COMMENT.sub(b"", stream.read(HEAD)))
     except OSError:
         return b""
+    return found[1] if found else b""
 
 
 def _name(path: Path) -> str:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -19,13 +18,12 @@ from fb3d_rl.assets.options import UNITS
 from fb3d_rl.assets.partnet_mobility import LARGEST_TEXT, load_object, named_errors
 from fb3d_rl.assets.urdf import UrdfReader
 from fb3d_rl.errors import UserError
-from fb3d_rl.importer.files import HEAD, Source
+from fb3d_rl.importer.files import Source, root_of
 from fb3d_rl.importer.frames import UNIT_NAMES, Frame, in_metres, upright
-from fb3d_rl.kinematics.opening import CONTROLS, LARGEST, openable_links
+from fb3d_rl.importer.mjcf import MjcfReader
+from fb3d_rl.importer.names import part_name
+from fb3d_rl.kinematics.opening import LARGEST, openable_links
 from fb3d_rl.kinematics.validation import Finding, Verdict, findings
-
-NAMES = CONTROLS | frozenset("door drawer lid cover seat screen window sash flap leaf cap".split())
-"""What a link can be called: the last of these words in its name is its semantic name."""
 
 MIXED = 100.0
 """Meshes so many times as large as the distances between joints are in other units than these."""
@@ -54,13 +52,10 @@ class FileReader(UrdfReader):
 
     def semantics(self) -> dict[str, str]:
         """Link name -> the last word in it that is a known name of a part."""
-        words = {
-            element.get("name", ""): [
-                word for word in re.split(r"[\W_\d]+", element.get("name", "").lower()) if word in NAMES
-            ]
-            for element in self.parse().findall("link")
+        names = {
+            element.get("name", ""): part_name(element.get("name", "")) for element in self.parse().findall("link")
         }
-        return {name: found[-1] for name, found in words.items() if found}
+        return {name: found for name, found in names.items() if found}
 
 
 def read_urdf(source: Source) -> Parsed:
@@ -78,7 +73,16 @@ def read_urdf(source: Source) -> Parsed:
     return links, (*dropped, f"lengths: the meshes are taken as {UNIT_NAMES[unit]}, the joints as metres"), lost
 
 
-READERS: dict[bytes, Callable[[Source], Parsed]] = {b"robot": read_urdf}
+def read_mjcf(source: Source) -> Parsed:
+    """The links of an MJCF, or of one body in it.
+
+    Raises:
+        UserError: something is missing or broken, or the package mujoco is.
+    """
+    return MjcfReader(source).read()
+
+
+READERS: dict[bytes, Callable[[Source], Parsed]] = {b"robot": read_urdf, b"mujoco": read_mjcf}
 """The reader of each kind of file, by the root element."""
 
 
@@ -117,10 +121,12 @@ def _parsed(source: Source) -> Parsed:
             raise UserError(
                 f"object {source.id}: {path} is larger than the {LARGEST_TEXT / 2**20:.0f} MiB that are read"
             )
-        with path.open("rb") as stream:
-            head = stream.read(HEAD)
-        kind = next((root for root in READERS if b"<" + root in head), b"robot")
-        return READERS[kind](source)
+        kind = root_of(path)
+        if source.body is not None and kind != b"mujoco":
+            raise UserError(
+                f"object {source.id}: assets.body={source.body} names a body of an MJCF, which {path} is not"
+            )
+        return READERS.get(kind, read_urdf)(source)
 
 
 def _category(source: Source) -> str:

@@ -394,9 +394,9 @@ RICH = robot(
 )
 
 
-def mutated(rng: np.random.Generator, urdf: str = RICH) -> bytes:
-    """A URDF with bytes changed, a tag dropped or doubled, or a value taken from elsewhere."""
-    data = bytearray(urdf.encode())
+def mutated(rng: np.random.Generator, text: bytes = RICH.encode()) -> bytes:
+    """A text, the rich URDF, with bytes changed, a tag dropped or doubled, or a value taken from elsewhere."""
+    data = bytearray(text)
     for _ in range(rng.integers(1, 4)):
         kind = rng.integers(4)
         if kind == 0:

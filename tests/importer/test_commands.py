@@ -32,7 +32,7 @@ def test_files_are_imported_as_folders_and_what_was_changed_is_said(tmp_path: Pa
     assert other.returncode == 0 and "0.01 times" in (said := " ".join(other.stdout.split())) and "faced +x" in said
     wrong = launch("objects.py", "import", "in", "--front", "-z", "--out", "no", cwd=tmp_path)
     assert wrong.returncode == 2 and "--front" in wrong.stderr
-    put(tmp_path / "broken.urdf", "<mujoco/>")
+    put(tmp_path / "broken.urdf", "<sdf/>")
     broken = launch("objects.py", "import", "broken.urdf", "in/small.urdf", "--out", "two", cwd=tmp_path)
     assert broken.returncode == 1 and "no URDF" in " ".join(broken.stdout.split())
     assert [folder.name for folder in (tmp_path / "two").iterdir()] == ["small"]

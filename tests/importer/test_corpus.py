@@ -88,7 +88,7 @@ def fuzz(folder: Path, seed: int, count: int) -> None:
     (folder / "a.obj").write_bytes(written("obj")["a.obj"])
     for k in range(count):
         path = folder / "a.urdf"
-        path.write_bytes(urdfs.mutated(rng, sources[k % len(sources)]))
+        path.write_bytes(urdfs.mutated(rng, sources[k % len(sources)].encode()))
         try:
             [source] = find_files(path)
             obj = read_file(source, Frame(up="y" if k % 3 == 0 else "z"))

@@ -106,7 +106,8 @@ def test_files_are_found_in_any_layout(tmp_path: Path) -> None:
     put(tmp_path / "Microwave/mw 1/model.urdf")
     put(tmp_path / "safe/model.urdf")
     put(tmp_path / "other.xml")
-    put(tmp_path / "scene.xml", "<mujoco/>")
+    put(tmp_path / "scene.xml", "<!-- <robot> --><sdf/>")
+    put(tmp_path / "part.xml", "<mujocoinclude/>")
     put(tmp_path / "Oven/7/mobility.urdf")
     put(tmp_path / ".hidden/x.urdf")
     found = {source.id: source for source in find_files(tmp_path)}
