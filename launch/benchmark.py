@@ -3,6 +3,7 @@
 python launch/benchmark.py                        steps, labels, workers, reading, loading, a soak test, networks
 python launch/benchmark.py --root DIR steps       one of them, with the PartNet-Mobility objects below DIR
 python launch/benchmark.py network --peer DIR     ArtFlowNet's training against PyTorch Geometric's, installed in DIR
+python launch/benchmark.py gpu --device cuda      ArtFlowNet's training and kernels on a GPU; needs no simulator
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak", "network")
+if TYPE_CHECKING:
+    from fb3d_rl.assets.articulation import ArticulatedObject
+
+BENCHMARKS = ("steps", "labelling", "workers", "reading", "loading", "soak", "network", "gpu")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -33,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=5, help="rounds of each comparison (default: 5)")
     parser.add_argument("--steps", type=int, default=10000, help="steps of the soak test (default: 10000)")
     parser.add_argument("--peer", type=Path, help="folder for the packages that 'network' compares with")
-    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="of 'network' (default: cpu)")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"), help="of network and gpu (default: cpu)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("results/runs/benchmark.json"), help="JSON file to write")
     options = parser.parse_args(arguments)
@@ -68,46 +72,38 @@ def run(options: argparse.Namespace) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from fb3d_rl.benchmarks import environment as benchmark
+    from fb3d_rl.benchmarks.card import card_speed
     from fb3d_rl.benchmarks.network import draw_clouds, install_peer, network_speed
-    from fb3d_rl.data.samples import SampleOptions
-    from fb3d_rl.env.options import EnvOptions
+    from fb3d_rl.env.torchrl_env import require_simulator
     from fb3d_rl.evaluation.tables import number_rows
     from fb3d_rl.files import write_text
     from fb3d_rl.importer.catalog import find_objects
     from fb3d_rl.kinematics.opening import openable_links
-    from fb3d_rl.rollout.trials import schedule
     from fb3d_rl.training.checkpoint import git_revision
 
     check(options)
+    names = options.names or BENCHMARKS
+    if any(name not in ("network", "gpu") for name in names):
+        require_simulator()
     console = Console()
     objects = [obj for obj in find_objects(options.root, options.split) if openable_links(obj)]
     by_category = list({obj.category: obj for obj in objects}.values())
-    env, rounds = EnvOptions(), options.rounds
+    rounds = options.rounds
     results: dict[str, Any] = {}
     with console.status("starting") as status:
-        for name in options.names or BENCHMARKS:
-            if name == "steps":
-                results[name] = benchmark.step_rates(by_category[:6], env, rounds, status.update)
-            elif name == "labelling":
-                results[name] = benchmark.labelling(by_category[:6], env, rounds, status.update)
-            elif name == "workers":
-                scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(), options.seed, limit=24)
-                results[name] = benchmark.worker_scaling(objects, scheduled, env, min(rounds, 3), status.update)
-            elif name == "reading":
-                if not options.root:  # the procedural objects are no longer on disk
-                    results[name] = {"not measured": "give --root"}
+        for name in names:
+            if name == "gpu":
+                if options.device != "cuda":
+                    results[name] = {"not measured": "give --device cuda"}
                     continue
-                results[name] = benchmark.reading([obj.urdf.parent for obj in objects], status.update)
+                results[name] = card_speed(draw_clouds(objects, 512, options.seed), 256, 4, status.update)
             elif name == "network":
                 if options.peer:
                     install_peer(options.peer, status.update)
                 clouds = draw_clouds(objects, 64, options.seed)
                 results[name] = network_speed(clouds, (64, 16), rounds, options.peer, options.device, status.update)
-            elif name == "loading":
-                results[name] = benchmark.loading(objects, env, status.update)
             else:
-                results[name] = benchmark.soak(objects[:50], env, options.steps, options.seed, status.update)
+                results[name] = _simulated(name, options, objects, by_category, status.update)
     about = {
         "command": " ".join(["python", *sys.argv]),
         "seed": options.seed,
@@ -121,6 +117,36 @@ def run(options: argparse.Namespace) -> None:
         table.add_row(*row)
     console.print(table)
     console.print(f"wrote {options.out}")
+
+
+def _simulated(
+    name: str,
+    options: argparse.Namespace,
+    objects: list[ArticulatedObject],
+    by_category: list[ArticulatedObject],
+    progress: Callable[[str], None],
+) -> dict[str, Any]:
+    """What a benchmark of the task measures."""
+    from fb3d_rl.benchmarks import environment as benchmark  # late: it needs the simulator
+    from fb3d_rl.data.samples import SampleOptions
+    from fb3d_rl.env.options import EnvOptions
+    from fb3d_rl.rollout.trials import schedule
+
+    env, rounds = EnvOptions(), options.rounds
+    if name == "steps":
+        return benchmark.step_rates(by_category[:6], env, rounds, progress)
+    if name == "labelling":
+        return benchmark.labelling(by_category[:6], env, rounds, progress)
+    if name == "workers":
+        scheduled, _ = schedule([(obj, "") for obj in objects], SampleOptions(), options.seed, limit=24)
+        return benchmark.worker_scaling(objects, scheduled, env, min(rounds, 3), progress)
+    if name == "reading":
+        if not options.root:  # the procedural objects are no longer on disk
+            return {"not measured": "give --root"}
+        return benchmark.reading([obj.urdf.parent for obj in objects], progress)
+    if name == "loading":
+        return benchmark.loading(objects, env, progress)
+    return benchmark.soak(objects[:50], env, options.steps, options.seed, progress)
 
 
 if __name__ == "__main__":
