@@ -51,6 +51,7 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("train", "experiment/comparison_partnet"): ["assets.root=."],
     ("evaluate", "experiment/comparison_partnet"): ["assets.root=."],
     ("train", "experiment/partnet_long"): ["assets.root=."],
+    ("train", "experiment/partnet_gpu"): ["assets.root=."],
     **{("serve", f"assets/{name}"): ["assets.root=."] for name in ("partnet_mobility", "files", "mixed")},
     **{(command, "policy/plugin"): ["policy.target=mine:make"] for command in ("evaluate", "serve")},
     ("evaluate", "policy/artflownet"): ["checkpoint=checkpoint.pt"],
@@ -60,7 +61,7 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/dagger"): ["checkpoint=checkpoint.pt"],
 }
-TRAINING_ONLY = {"experiment/partnet_long", "experiment/partnet"}
+TRAINING_ONLY = {"experiment/partnet_long", "experiment/partnet_gpu", "experiment/partnet"}
 
 
 @pytest.fixture(autouse=True)
