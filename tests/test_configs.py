@@ -265,7 +265,7 @@ def types_of(kind: type) -> dict[str, Any]:
     """The types of a class's annotated attributes, where they are known at run time."""
     try:
         return get_type_hints(kind)
-    except NameError:
+    except (NameError, TypeError):  # of a library that is compiled without what it names
         return {}
 
 
