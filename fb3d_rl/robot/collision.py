@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import Arm
 from fb3d_rl.robot.capsules import segment_distance
 
@@ -60,6 +61,11 @@ class Obstacles:
     boxes: Sequence[Box] = ()
     points: Array = field(default_factory=lambda: np.zeros((0, 3)))
     radius: float = 0.01
+
+    def __post_init__(self) -> None:
+        if self.points.ndim != 2 or self.points.shape[1] != 3 or not np.isfinite(self.points).all():
+            shape = "x".join(map(str, self.points.shape))
+            raise UserError(f"a cloud of obstacles is an array [P, 3] of finite numbers (m); this one, {shape}, is not")
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -181,6 +187,7 @@ def bodies(arm: Arm, q: Array) -> Array:
     return np.asarray(arm.ends @ poses[..., :3, :3].swapaxes(-1, -2) + poses[..., None, :3, 3])
 
 
+@cache
 def _touching_pairs(arm: Arm) -> NDArray[np.int64]:
     """Pairs [P, 2] of bodies that can touch: not of neighbouring links, nor always in touch."""
     i, j = np.triu_indices(len(arm.links), 1)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import alignment, matrix_to_quaternion, normalize, rigid, rotate
 from fb3d_rl.robot.arm import Arm
 
@@ -83,7 +84,12 @@ def precontact_poses(point: Tensor, flow: Tensor, tip: Tensor, distance: float =
     Returns:
         T_base_tip [rolls, 4, 4]. The first is turned as little as possible, as the supplement has it; the others follow
         turned on about the flow.
+
+    Raises:
+        UserError: the flow is 0, or a number is not finite.
     """
+    if not (bool(torch.isfinite(flow).all() & torch.isfinite(point).all()) and bool(flow.any())):
+        raise UserError("the flow at the contact is 0, or it or the contact is not finite: there is no way to approach")
     way = normalize(flow.to(tip))
     turn = alignment(tip[:3, 2], -way)
     facing = rotate(tip[:3, :3].mT, turn[None]).mT

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import Arm
 from fb3d_rl.robot.collision import Checker, Obstacles
 from fb3d_rl.robot.inverse import STARTS, Solutions, solve
@@ -89,9 +90,14 @@ def plan(
         seed: of all that is drawn.
         timeout: for the search, s.
         margin: to keep from everything, m; given up where the start is nearer than that, but free.
+
+    Raises:
+        UserError: a number is not finite.
     """
     began = time.monotonic()
     here = np.asarray(start, dtype=np.float64)
+    if not (np.isfinite(here).all() and bool(torch.isfinite(poses).all())):
+        raise UserError("the arm's joint state, or a pose that it is to go to, is not finite")
     result = _planned(arm, obstacles, here, poses, seed, began + timeout, margin)
     return Plan(**{**vars(result), "seconds": time.monotonic() - began})
 

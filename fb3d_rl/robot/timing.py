@@ -20,9 +20,11 @@ Array = NDArray[np.float64]
 CORNER = 0.3
 """Up to so far (rad) from a corner of its path the motion cuts it; halved until it touches nothing."""
 
-HALVINGS = 6
-FINE = 0.006
-"""Between the states of the rounded path that are checked, rad: no point of an arm of 1.5 m moves more than 1 cm."""
+HALVINGS = 8
+"""After the last one the curve is within 1 mm or so of the path, which is less than the margin of a path."""
+
+FINE = 0.004
+"""Between the states of the rounded path that are checked, rad (Euclidean norm): the tip moves less than 1 cm."""
 
 GRID = 0.02
 """Between the points of the path at which the limits are kept exactly, rad."""

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import SPEED, Arm
 from fb3d_rl.robot.collision import Checker
 
@@ -57,8 +58,13 @@ def resolve(arm: Arm, q: Tensor, twist: Tensor, checker: Checker | None = None, 
         twist: velocity (m/s) and angular velocity (rad/s) of the tip in the base's axes [6].
         checker: what bodies must not come near; of its obstacles only the robot itself counts.
         speed: limit for all joints beside their own, rad/s.
+
+    Raises:
+        UserError: a number is not finite.
     """
     q, twist = q.to(arm.home), twist.to(arm.home)
+    if not bool(torch.isfinite(torch.cat([q, twist])).all()):
+        raise UserError("the arm's joint state, or the velocity that is asked of its tip, is not finite; stop the arm")
     weight = torch.tensor([1.0] * 3 + [LEVER] * 3, dtype=q.dtype)
     jacobian = arm.jacobian(q)
     least = (BRAKE * (arm.lower - q)).clamp_max(0.0)

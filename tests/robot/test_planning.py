@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import SPEED, sawyer
 from fb3d_rl.robot.capsules import segment_distance
 from fb3d_rl.robot.collision import Checker, Obstacles, bodies
@@ -117,6 +118,17 @@ def test_each_failure_has_its_reason_in_a_sentence() -> None:
     ]  # fmt: skip
     assert all(one.path is None and one.reason and one.goal == -1 for one in plans)
     assert Counter(one.failure for one in plans)["unreachable"] == 1  # counted by what a row has
+
+
+def test_numbers_that_are_not_finite_are_refused_in_a_sentence() -> None:
+    arm, nan = sawyer(), np.full((4, 3), np.nan)
+    with pytest.raises(UserError, match=r"4x3, is not"):
+        Obstacles(points=nan)
+    for flow in (np.zeros(3), nan[0]):
+        with pytest.raises(UserError, match="no way to approach"):
+            poses(CONTACT[0], flow)
+    with pytest.raises(UserError, match="joint state"):
+        plan(arm, cupboard(), arm.home * np.nan, poses(*CONTACT))
 
 
 def test_a_start_within_the_margin_is_no_collision() -> None:

@@ -61,7 +61,7 @@ def test_nearly_all_poses_that_can_be_reached_are_planned_to_in_a_second(arm) ->
         bare = Checker(arm, obstacles, margin=0.0)
         for path in (found.path, motion.positions):
             pieces = np.linalg.norm(np.diff(path, axis=0), axis=1)
-            shares = [np.linspace(0.0, 1.0, 2 + int(piece / 0.006)) for piece in pieces]  # less than 1 cm anywhere
+            shares = [np.linspace(0.0, 1.0, 2 + int(piece / 0.004)) for piece in pieces]  # less than 1 cm anywhere
             states = [a + s[:, None] * (b - a) for a, b, s in zip(path[:-1], path[1:], shares, strict=True)]
             assert bare.free(np.concatenate(states)).all()
     print(f"\n{arm.name}: {len(seconds)} of {reachable} reachable in {SCENES} scenes, {np.median(seconds):.2f} s each")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import panda, sawyer
 from fb3d_rl.robot.collision import Checker, Obstacles
 from fb3d_rl.robot.velocity import resolve
@@ -76,6 +77,11 @@ def test_bodies_of_the_robot_keep_apart() -> None:
         slowed.append(result.slowed)
         assert bare.free(q.numpy()[None]).all()
     assert slowed[0] == 1.0 and slowed[-1] < 0.3
+
+
+def test_a_velocity_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(UserError, match="not finite"):
+        resolve(sawyer(), sawyer().home, TWIST * torch.nan)
 
 
 def test_a_twist_of_nothing_moves_nothing() -> None:
