@@ -40,6 +40,7 @@ def scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("arm", [sawyer, panda], ids=["sawyer", "panda"])
 def test_nearly_all_poses_that_can_be_reached_are_planned_to_in_a_second(arm) -> None:
     arm = arm()
@@ -65,6 +66,6 @@ def test_nearly_all_poses_that_can_be_reached_are_planned_to_in_a_second(arm) ->
             states = [a + s[:, None] * (b - a) for a, b, s in zip(path[:-1], path[1:], shares, strict=True)]
             assert bare.free(np.concatenate(states)).all()
     print(f"\n{arm.name}: {len(seconds)} of {reachable} reachable in {SCENES} scenes, {np.median(seconds):.2f} s each")
-    assert reachable > 0.4 * SCENES
+    assert reachable > 0.3 * SCENES  # the Panda is shorter
     assert len(seconds) >= 0.98 * reachable
     assert np.median(seconds) < 1.0
