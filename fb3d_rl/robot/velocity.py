@@ -1,0 +1,106 @@
+"""Joint velocities for a velocity of the tip (supplement I.G): damped, within limits, clear of the robot itself."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.robot.arm import SPEED, Arm
+from fb3d_rl.robot.collision import Checker
+
+SINGULAR = 0.05
+"""Below this singular value of the Jacobian (angular velocities weighed by LEVER) the motion is damped."""
+
+DAMPING = 0.05
+"""Of a direction in which the tip cannot move at all."""
+
+LEVER = 0.2
+"""An angular velocity of 1 rad/s weighs as much as a velocity of so many m/s."""
+
+BRAKE = 4.0
+"""A joint approaches its limit, and a body another one, by this share of what is left, 1/s."""
+
+AHEAD = 0.02
+"""How far ahead distances between bodies are looked at, s."""
+
+HELD = 0.01
+"""A joint that is nearer to its limit (rad) than this and pushed towards it is held."""
+
+
+class Resolved(NamedTuple):
+    """Joint velocities and what limits them.
+
+    Attributes:
+        velocity: [J], rad/s.
+        share: how much of the velocity asked for the tip gets in its direction, 1 for all of it.
+        held: joints [J] bool that stand at a limit and would have to go beyond it.
+        slowed: the share, 0 to 1, that is left of the velocity so that bodies of the robot keep apart.
+    """
+
+    velocity: Tensor
+    share: float
+    held: Tensor
+    slowed: float
+
+
+def resolve(arm: Arm, q: Tensor, twist: Tensor, checker: Checker | None = None, speed: float = SPEED) -> Resolved:
+    """Joint velocities that move the tip as asked, as far as the arm can.
+
+    Joints near a limit slow down towards it, and the others take over what they can; if one would be too fast, all are
+    slowed, so that the tip keeps its direction.
+
+    Args:
+        arm: the arm.
+        q: joint state [J], rad.
+        twist: velocity (m/s) and angular velocity (rad/s) of the tip in the base's axes [6].
+        checker: what bodies must not come near; of its obstacles only the robot itself counts.
+        speed: limit for all joints beside their own, rad/s.
+
+    Raises:
+        UserError: a number is not finite.
+    """
+    q, twist = q.to(arm.home), twist.to(arm.home)
+    if not bool(torch.isfinite(torch.cat([q, twist])).all()):
+        raise UserError("the arm's joint state, or the velocity that is asked of its tip, is not finite; stop the arm")
+    weight = torch.tensor([1.0] * 3 + [LEVER] * 3, dtype=q.dtype)
+    jacobian = arm.jacobian(q)
+    least = (BRAKE * (arm.lower - q)).clamp_max(0.0)
+    most = (BRAKE * (arm.upper - q)).clamp_min(0.0)
+    velocity = torch.zeros_like(q)
+    fixed = torch.zeros_like(q, dtype=torch.bool)
+    for _ in range(len(q)):
+        rest = weight * (twist - jacobian[:, fixed] @ velocity[fixed])
+        velocity[~fixed] = _damped(weight[:, None] * jacobian[:, ~fixed], rest)
+        beyond = (velocity < least - 1e-12) | (velocity > most + 1e-12)
+        if not bool((beyond & ~fixed).any()):
+            break
+        velocity = torch.minimum(torch.maximum(velocity, least), most)
+        fixed |= beyond
+    held = fixed & (torch.minimum(q - arm.lower, arm.upper - q) < HELD)
+    fastest = float((velocity.abs() / arm.velocity.clamp_max(speed)).max())
+    velocity = velocity / max(fastest, 1.0)
+    slowed = 1.0 if checker is None else _slowed(checker, q, velocity)
+    velocity = slowed * velocity
+    asked = weight * twist
+    share = float((weight * (jacobian @ velocity)) @ asked / (asked @ asked).clamp_min(1e-12))
+    return Resolved(velocity, share, held, slowed)
+
+
+def _damped(jacobian: Tensor, twist: Tensor) -> Tensor:
+    """Least-squares joint velocities [J] for a twist [6], damped where the Jacobian [6, J] is nearly singular."""
+    if jacobian.shape[1] == 0:
+        return twist.new_zeros(0)
+    u, size, vh = torch.linalg.svd(jacobian, full_matrices=False)
+    damping = DAMPING**2 * (1.0 - (size / SINGULAR).clamp_max(1.0).square())
+    return vh.mT @ (size / (size.square() + damping).clamp_min(1e-12) * (u.mT @ twist))
+
+
+def _slowed(checker: Checker, q: Tensor, velocity: Tensor) -> float:
+    """How much of joint velocities [J] leaves each pair of bodies its distance, or approaches it gently."""
+    now, then = checker.clearance(torch.stack([q, q + AHEAD * velocity]).numpy()).itself
+    closing = (now - then) / AHEAD
+    allowed = BRAKE * now.clip(0.0)
+    return float(min(1.0, (allowed / closing.clip(1e-9))[closing > 1e-9].min(initial=1.0)))
