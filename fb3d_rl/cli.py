@@ -16,6 +16,7 @@ COMMANDS = {
     "demos": "record, replay, list, filter, convert or collect demonstrations",
     "predict": "flow, contact point and gripper pose of a cloud of your own",
     "serve": "a policy server for robots, which openpi-client talks to",
+    "robot": "a robot arm before a depth camera: hand-eye calibration",
     "report": "the page of a run, or of a comparison of several",
     "view": "the live page: an object, its flow, and the gripper",
     "benchmark": "throughput beside others, measured in one run",

@@ -20,6 +20,9 @@ MATRICES = ("K", "k", "cam_K", "camera_matrix", "intrinsic_matrix", "intrinsics"
 NUMBERS = {"fx": ("fx",), "fy": ("fy",), "cx": ("cx", "ppx"), "cy": ("cy", "ppy")}
 """Names of the four numbers; ppx and ppy are RealSense's."""
 
+DISTORTIONS = ("D", "d", "distortion_coefficients", "dist_coeffs", "distortion", "coeffs")
+"""Names of the coefficients of distortion: ROS, OpenCV, RealSense and others."""
+
 
 class Intrinsics(NamedTuple):
     """A pinhole camera: focal lengths and principal point in pixels; units of the image in a metre, if it says so."""
@@ -31,6 +34,8 @@ class Intrinsics(NamedTuple):
     width: int | None = None
     height: int | None = None
     per_metre: float | None = None
+    distortion: tuple[float, ...] = ()
+    """OpenCV's coefficients k1, k2, p1, p2, k3 ...; only :func:`read_distortion` reads them."""
 
 
 def read_depth(path: Path) -> NDArray[np.float32]:
@@ -55,12 +60,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     Raises:
         UserError: it is none, or the numbers make no camera.
     """
-    try:
-        text = path.read_text("utf-8").replace("!!opencv-matrix", "").replace("%YAML:1.0", "")
-        content = yaml.safe_load(text.replace("\t", " "))  # JSON is YAML
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
-        raise UserError(f"{path} is neither JSON nor YAML: {' '.join(str(error).split())}.") from error
-    return intrinsics_in(content, str(path))
+    return intrinsics_in(_content(path), str(path))
 
 
 def intrinsics_in(content: Any, name: str) -> Intrinsics:
@@ -74,6 +74,35 @@ def intrinsics_in(content: Any, name: str) -> Intrinsics:
     except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
         names = "fx, fy, cx and cy, or a 3 x 3 matrix such as K"
         raise UserError(f"{name} does not tell a camera's intrinsics: give {names}.") from error
+
+
+def read_distortion(path: Path) -> tuple[float, ...]:
+    """The coefficients of distortion in a file of intrinsics; none if it has none.
+
+    Raises:
+        UserError: they are none of OpenCV's pinhole models.
+    """
+    found = _flat(_content(path))
+    given = next((found[name] for name in DISTORTIONS if name in found), ())
+    try:
+        numbers = tuple(np.asarray(given, dtype=np.float64).ravel().tolist())
+    except (TypeError, ValueError):
+        numbers = (math.nan,)
+    fisheye = str(found.get("distortion_model", "")).lower() in ("equidistant", "fisheye", "kannala_brandt4")
+    if fisheye or len(numbers) not in (0, 4, 5, 8, 12, 14) or not all(map(math.isfinite, numbers)):
+        raise UserError(
+            f"{path} has a distortion that is not OpenCV's k1, k2, p1, p2, k3 ... (4, 5, 8, 12 or 14 numbers): "
+            f"undistort the images and leave it out."
+        )
+    return numbers
+
+
+def _content(path: Path) -> Any:
+    try:
+        text = path.read_text("utf-8").replace("!!opencv-matrix", "").replace("%YAML:1.0", "")
+        return yaml.safe_load(text.replace("\t", " "))  # JSON is YAML
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError, ValueError) as error:
+        raise UserError(f"{path} is neither JSON nor YAML: {' '.join(str(error).split())}.") from error
 
 
 def _flat(content: Any, deep: int = 0) -> dict[str, Any]:
