@@ -48,6 +48,12 @@ class CameraOptions:
         """Centres [resolution] of the pixels: x / z of the columns and y / z of the rows."""
         return ((np.arange(self.resolution) + 0.5) / self.resolution * 2.0 - 1.0) * self.slope
 
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """Focal lengths and principal point fx, fy, cx, cy in pixels, whose centres are whole numbers."""
+        focal, middle = 0.5 * self.resolution / self.slope, 0.5 * (self.resolution - 1)
+        return focal, focal, middle, middle
+
 
 @dataclass(frozen=True)
 class DepthCameraOptions(ViewRange, CameraOptions):

@@ -30,6 +30,10 @@ keys sort as depths do, and of two bodies at the same depth the one with the low
 are merged. From this key on there is no hit."""
 
 
+def _depth(keys: NDArray[np.uint64]) -> NDArray[np.float32]:
+    return (keys >> _HALF).astype(np.uint32).view(np.float32)
+
+
 class RaycastCamera:
     """Depth camera before one object, and further bodies (a gripper) that may occlude it.
 
@@ -89,16 +93,26 @@ class RaycastCamera:
         Raises:
             ValueError: there is not one pose for each link and further body.
         """
-        if len(poses) != len(self._corners):
-            raise ValueError(f"{len(poses)} poses were given for {len(self._corners)} links and further bodies")
-        image = self._nearest(np.array(poses, dtype=np.float64, order="C"), view).ravel()
+        image = self._nearest(poses, view).ravel()
         seen = np.flatnonzero((image < _NOTHING) if further else (image < _NOTHING) & ((image & _LOW) < self._links))
         keys = image.take(seen)
-        depth = (keys >> _HALF).astype(np.uint32).view(np.float32)
-        return pixel_points(self._camera, self._rays, seen, depth), (keys & _LOW).astype(np.int64)
+        return pixel_points(self._camera, self._rays, seen, _depth(keys)), (keys & _LOW).astype(np.int64)
+
+    def depth_image(self, poses: NDArray[np.float64], view: View) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+        """Take one depth image; what :meth:`capture` takes, by pixels.
+
+        Returns:
+            Depth [n, n] (m along the camera's axis) and the index of the body hit [n, n]; 0 and -1 where no ray hits.
+        """
+        image = self._nearest(poses, view)
+        hit = image < _NOTHING
+        return np.where(hit, _depth(image), np.float32(0)), np.where(hit, (image & _LOW).astype(np.int64), -1)
 
     def _nearest(self, poses: NDArray[np.float64], view: View) -> NDArray[np.uint64]:
         """Keys [n, n] of what each pixel shows. The hits of links that rest are kept merged, as the background."""
+        if len(poses) != len(self._corners):
+            raise ValueError(f"{len(poses)} poses were given for {len(self._corners)} links and further bodies")
+        poses = np.array(poses, dtype=np.float64, order="C")
         links = np.arange(len(poses)) < self._links
         last, self._view = self._view, None  # nothing is kept of a frame that fails
         if view != last:

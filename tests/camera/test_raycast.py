@@ -20,6 +20,7 @@ from fb3d_rl.camera.raycast import CameraOptions, RaycastCamera
 from fb3d_rl.camera.views import View
 from fb3d_rl.kinematics.opening import opening_range, standing_pose
 from fb3d_rl.kinematics.tree import KinematicTree
+from fb3d_rl.perception.depth import Intrinsics, points_of
 
 OPTIONS = CameraOptions(resolution=33)
 FRONT = View(0.0, 0.0)
@@ -58,6 +59,23 @@ def still(count: int, *poses: np.ndarray) -> np.ndarray:
 
 def local(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return (points - pose[:3, 3]) @ pose[:3, :3]
+
+
+@pytest.mark.parametrize("view", [FRONT, View(40.0, 35.0)])
+def test_a_depth_image_is_the_cloud_by_pixels(view: View) -> None:
+    obj, bar = drawer(), [box((0.1, 0.1, 2.0), (-1.0, 0.3, 0.0))]
+    camera = RaycastCamera(obj, [bar], OPTIONS)
+    points, bodies = camera.capture(still(3), view)
+    depth, labels = camera.depth_image(still(3), view)
+    assert depth.shape == labels.shape == (33, 33) and depth.dtype == np.float32
+    np.testing.assert_array_equal(depth > 0, labels >= 0)
+    np.testing.assert_array_equal(labels[labels >= 0], bodies)
+    assert {*bodies} == {0, 1, 2}
+    organised = points_of(depth, Intrinsics(*OPTIONS.pinhole), 1.0)
+    pose = camera.pose(view)
+    np.testing.assert_allclose(
+        organised[depth.ravel() > 0] @ pose[:3, :3].T + pose[:3, 3], points, atol=2e-6
+    )  # the camera's own and that of files agree where a pixel's centre is
 
 
 @pytest.mark.parametrize("view", [FRONT, View(40.0, 35.0), View(-120.0, 70.0), View(10.0, -20.0)])
