@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
 import pytest
@@ -16,8 +14,8 @@ from fb3d_rl.robot.marker import project
 
 from .cells import MARKER, Array, camera_and_mount, chosen, small, turned_by
 
-DEGREES, METRES = 0.3 / math.sqrt(3), 0.001 / math.sqrt(3)
-"""Along each axis: noise of .3 degrees and 1 mm in all."""
+DEGREES, METRES = 0.3, 0.001
+"""Noise of the marker's pose along each axis."""
 
 
 def rays_of(seen: Array) -> Array:
