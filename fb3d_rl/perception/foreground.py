@@ -1,4 +1,6 @@
-"""What of a cloud is the object (supplement, I.D): which way is up, what it stands on, and where the camera was."""
+"""What of a cloud is the object (supplement, I.D): what it stands on, what is the robot's, which way is up, and where
+the camera was.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from fb3d_rl.geometry.transforms import alignment, rotate
@@ -33,6 +36,15 @@ class Plane(NamedTuple):
     height: float
 
 
+LEVEL = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
+"""The table, in a frame that stands on it."""
+
+
+def above(points: NDArray[np.floating], support: Plane = LEVEL, least: float = HEIGHT) -> NDArray[np.bool_]:
+    """Which points [..., 3] are higher than ``least`` (m) above a plane; NaN is not."""
+    return np.asarray(points @ support.normal - support.height > least)
+
+
 def turned_up(up: Points) -> Points:
     """The rotation [3, 3] by the shortest way that takes a direction [3] to +z."""
     turn = alignment(torch.as_tensor(up, dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
@@ -50,24 +62,55 @@ def support_plane(points: Points, up: Points, tilt: float, rng: np.random.Genera
     """
     some = points[rng.choice(len(points), min(len(points), _SAMPLE), replace=False)]
     thick = max(0.008, 0.004 * float(np.linalg.norm(np.ptp(some, axis=0))))
-    best, most = None, 0.1 * len(some)
-    for a, b, c in some[rng.integers(len(some), size=(_TRIPLES, 3))]:
+    plane = _plane(some, up, tilt, thick, 0.02, rng)
+    return plane if plane is not None and _reaches_beyond(some, plane, thick) else None
+
+
+def table_plane(
+    points: Points, rng: np.random.Generator, expected: Plane = LEVEL, off: float = 0.03, tilt: float = 0.3
+) -> Plane:
+    """The table, whose place is roughly known, by RANSAC; a camera whose calibration is a little off sees it elsewhere.
+
+    Args:
+        points: [..., 3] m, NaN where nothing was measured.
+        rng: draws the planes that are tried.
+        expected: where it should be.
+        off: how far from there its points may be, m.
+        tilt: largest angle (rad) between the expected normal and the found one.
+
+    Returns:
+        The plane; the expected one where too few points make one.
+    """
+    near = points[np.abs(points @ expected.normal - expected.height) < off]
+    if len(near) < 3:
+        return expected
+    some = near[rng.choice(len(near), min(len(near), _SAMPLE), replace=False)]
+    return _plane(some, expected.normal, tilt, 0.008, 1.0, rng) or expected
+
+
+def _plane(
+    points: Points, up: Points, tilt: float, thick: float, below: float, rng: np.random.Generator
+) -> Plane | None:
+    """The plane, ``thick`` to either side, with most of the points [N, 3] and less than a share ``below`` of them under
+    it; None if there is none with a tenth of them.
+    """
+    best, most = None, 0.1 * len(points)
+    for a, b, c in points[rng.integers(len(points), size=(_TRIPLES, 3))]:
         normal = np.cross(b - a, c - a)
         size = float(np.linalg.norm(normal))
         normal = normal / max(size, 1e-12) * (1.0 if normal @ up >= 0 else -1.0)
         if size < 1e-9 or normal @ up < np.cos(tilt):
             continue
-        above = some @ normal - normal @ a
-        on = np.abs(above) < thick
-        if on.sum() > most and (above < -2 * thick).mean() < 0.02:
+        height = points @ normal - normal @ a
+        on = np.abs(height) < thick
+        if on.sum() > most and (height < -2 * thick).mean() < below:
             best, most = on, on.sum()
     if best is None:
         return None
-    middle = some[best].mean(0)
-    normal = np.linalg.svd(some[best] - middle, full_matrices=False)[2][2]
-    plane = Plane(normal if normal @ up >= 0 else -normal, 0.0)
-    plane = Plane(plane.normal, float(plane.normal @ middle))
-    return plane if _reaches_beyond(some, plane, thick) else None
+    middle = points[best].mean(0)
+    normal = np.linalg.svd(points[best] - middle, full_matrices=False)[2][2]
+    normal = normal if normal @ up >= 0 else -normal
+    return Plane(normal, float(normal @ middle))
 
 
 def _reaches_beyond(points: Points, plane: Plane, thick: float) -> bool:
@@ -83,6 +126,46 @@ def _reaches_beyond(points: Points, plane: Plane, thick: float) -> bool:
         if wide < _WIDER * narrow:
             return False
     return True
+
+
+def on_robot(
+    depth: NDArray[np.floating], robot: NDArray[np.floating], band: float = 0.03, dilation: int = 4
+) -> NDArray[np.bool_]:
+    """Which pixels [H, W] show the robot: what lies at or behind where its model is drawn, with a margin for the errors
+    of calibration and camera. What is in front of the robot stays.
+
+    Args:
+        depth: [H, W] measured, m, 0 where nothing was.
+        robot: [H, W] of the robot's model alone in its present posture, drawn from the calibrated camera, likewise.
+        band: how far before the model a pixel may lie, m.
+        dilation: radius by which the model's outline is widened, pixels.
+    """
+    y, x = np.ogrid[-dilation : dilation + 1, -dilation : dilation + 1]
+    model = minimum_filter(
+        np.where(robot > 0, robot, np.inf), footprint=x**2 + y**2 <= dilation**2, mode="constant", cval=np.inf
+    )
+    return np.asarray((depth > 0) & (depth > model - band))
+
+
+def object_points(
+    points: Points, table: Plane, robot: NDArray[np.bool_] | None = None, least: float = HEIGHT, deviations: float = 2.0
+) -> NDArray[np.bool_]:
+    """Which points of an organised cloud are the object's: above the table, not the robot's, and no outliers of what is
+    left. Meant for the whole cloud, before it is thinned: in a thin one outliers are not sparser than the rest.
+
+    Args:
+        points: [N, 3] m, NaN where nothing was measured.
+        table: of :func:`table_plane`, or :data:`LEVEL`.
+        robot: [N] of :func:`on_robot`.
+        least: height above the table, m.
+        deviations: of :func:`outliers`; inf keeps them.
+    """
+    kept = above(points, table, least)
+    if robot is not None:
+        kept &= ~robot
+    if np.isfinite(deviations):
+        kept[kept] = ~outliers(points[kept], deviations=deviations)
+    return kept
 
 
 def outliers(points: Points, neighbors: int = 20, deviations: float = 3.0) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.foreground import HEIGHT, outliers, support_plane, turned_up, viewpoint
+from fb3d_rl.perception.foreground import above, outliers, support_plane, turned_up, viewpoint
 
 Array = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class Setting:
         points = (cloud - base) @ turn.T
         inside = close
         if foreground and (plane is not None or ground is not None):
-            inside = close & (points[:, 2] > HEIGHT)
+            inside = close & above(points)
             inside[inside] = ~outliers(points[inside])
         if inside.sum() < 3:
             raise UserError("Nothing of the cloud is above its support: check up and ground, or give foreground=false.")
