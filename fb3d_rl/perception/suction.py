@@ -30,6 +30,9 @@ _MOUTH = 128
 _BLOCK = 500
 """Points whose neighbourhoods are in memory at once."""
 
+_TESTS = 500
+"""Places whose seal is tested before the first of them is taken: a cloud may be too noisy to show one."""
+
 
 @dataclass(frozen=True)
 class CupOptions:
@@ -63,10 +66,11 @@ class PlaceOptions:
     curvature: float = option(0.045, "curvature above which a point is no place for a cup", within="[0, inf)")
     distance: float = option(0.02, "where the max-flow point is none, its stand-in is this far off", "m", "[0, inf)")
     flow: float = option(0.5, "least share of the largest flow that a point must have", within="[0, 1]")
-    rim: bool = option(True, "whether the lip of the cup must have surface below it all around")
-    margin: float = option(
-        0.003, "by how much farther out than the lip there must be surface, and how near", "m", "(0, inf)"
+    rim: bool = option(
+        True, "whether the lip must have surface below it all around, and the cup hold as far as one sees"
     )
+    margin: float = option(0.005, "by how much farther out than the lip: a hand misses by millimetres", "m", "[0, inf)")
+    near: float = option(0.003, "how near to the plane around the point that surface must be", "m", "(0, inf)")
 
     def __post_init__(self) -> None:
         check(self)
@@ -232,7 +236,8 @@ def choose_place(
         options: thresholds.
 
     Returns:
-        None if there is no good point among those that move.
+        None if there is no good point among those that move. With the test for rims :func:`seal` has to hold, too;
+        where it does nowhere near, on a noisy cloud, the first point that is good otherwise.
 
     Raises:
         UserError: nothing moves, or a point or a flow is no number.
@@ -246,16 +251,20 @@ def choose_place(
     distance = np.linalg.norm(points[moves] - points[peak], axis=1)
     order = distance.argsort(kind="stable")
     stand_ins = moves[order[distance[order] >= options.distance]]
-    tree = cKDTree(points)
+    tree, unsealed = cKDTree(points), list[Place]()
     for start in range(-_BLOCK, len(stand_ins), _BLOCK):  # the nearest first, so that few are looked at
         rows = np.array([peak]) if start < 0 else stand_ins[start : start + _BLOCK]
         curvature, ring, normals = _surface(points, points[rows], tree, cup, options)
-        good = np.flatnonzero((curvature <= options.curvature) & ((ring >= cup.ring) | (not options.rim)))
-        if len(good):
-            first, row = good[0], int(rows[good[0]])
-            normal = normals[first] * (1.0 if normals[first] @ (camera - points[row]) >= 0 else -1.0)
-            return Place(row, float(curvature[first]), float(ring[first]), normal, start >= 0)
-    return None
+        good = (curvature <= options.curvature) & ((ring >= cup.ring) | (not options.rim))
+        for i in np.flatnonzero(good):
+            normal = normals[i] * (1.0 if normals[i] @ (camera - points[rows[i]]) >= 0 else -1.0)
+            place = Place(int(rows[i]), float(curvature[i]), float(ring[i]), normal, start >= 0)
+            if not options.rim or seal(points, points[rows[i]], -normal, cup, smoothing=0.3 * cup.radius).holds:
+                return place
+            unsealed.append(place)
+        if len(unsealed) > _TESTS:
+            break
+    return unsealed[0] if unsealed else None
 
 
 def surface(
@@ -267,11 +276,11 @@ def surface(
         points: [N, 3] m, finite.
         at: [M, 3] m.
         cup: the cup.
-        options: radius and margin.
+        options: radius, margin and near.
 
     Returns:
-        PCA curvature [M], 0 to 1/3; the share [M] of a cup's lip, widened by the margin, that has points as near as the
-        margin; and unit normals [M, 3] of either sign.
+        PCA curvature [M], 0 to 1/3; the share [M] of a cup's lip, widened by the margin, that has points near it; and
+        unit normals [M, 3] of either sign.
     """
     cup, options = cup or CupOptions(), options or PlaceOptions()
     tree = cKDTree(points)
@@ -297,5 +306,5 @@ def _surface(
     second = np.cross(normals, first)
     turn = 2.0 * np.pi * np.arange(_RING)[:, None, None] / _RING
     ring = (at + height * normals) + (cup.radius + options.margin) * (np.cos(turn) * first + np.sin(turn) * second)
-    near = np.isfinite(tree.query(ring, distance_upper_bound=options.margin)[0])
+    near = np.isfinite(tree.query(ring, distance_upper_bound=options.near)[0])
     return curvature, near.mean(0), normals

@@ -57,12 +57,14 @@ class Seen(NamedTuple):
     Attributes:
         points: [P, 3] m, NaN where nothing was measured.
         label: [P] 0 on the object, 1 on the table, 2 on the robot, -1 between them or where nothing was measured.
+        link: [P] the object's link at each pixel, before any error; other numbers elsewhere.
         depth: [H, W] m.
         robot: [H, W] m, of the robot's model alone.
     """
 
     points: NDArray[np.float64]
     label: NDArray[np.int64]
+    link: NDArray[np.int64]
     depth: NDArray[np.float32]
     robot: NDArray[np.float32]
 
@@ -73,6 +75,7 @@ class Scene:
     def __init__(self, obj: ArticulatedObject) -> None:
         size = float(np.linalg.norm(np.ptp(Posed(obj).bounds(Posed(obj).closed), axis=0)))
         posed = Posed(shrunk(obj, DIAGONAL / size))
+        self.posed = posed
         self.poses = posed.poses(posed.closed + 0.15 * (posed.opened - posed.closed))
         low, high = posed.bounds(posed.closed)
         front, middle = np.array([low[0], 0.0, 0.0]), 0.5 * (low + high)
@@ -85,9 +88,20 @@ class Scene:
         self.table = np.eye(4)
         self.table[:3, 3] = [middle[0], middle[1], -0.01]
 
-    def see(self, view: View, noise: DepthNoiseOptions, seed: int, degrees: float = 0.0, metres: float = 0.0) -> Seen:
+    def see(
+        self,
+        view: View,
+        noise: DepthNoiseOptions,
+        seed: int,
+        degrees: float = 0.0,
+        metres: float = 0.0,
+        arm: bool = True,
+    ) -> Seen:
         """A picture, where the calibrated camera pose is off by a turn and a shift in directions that are drawn."""
-        depth, bodies = self.camera.depth_image(np.concatenate([self.poses, [self.table, np.eye(4)]]), view)
+        away = np.eye(4)
+        away[2, 3] = FAR_BELOW
+        placed = np.concatenate([self.poses, [self.table, np.eye(4) if arm else away]])
+        depth, bodies = self.camera.depth_image(placed, view)
         shot = measured(depth, OPTICS.ticks, OPTICS.ticks, noise, seed, bodies=bodies)
         axis, way = np.random.default_rng(seed).normal(size=(2, 3))
         off = np.eye(4)
@@ -95,12 +109,10 @@ class Scene:
         off[:3, 3] = metres * way / np.linalg.norm(way)
         true = self.camera.pose(view)
         believed = true @ off
-        away = np.eye(4)
-        away[2, 3] = FAR_BELOW
         alone = [away] * (self.links + 1)
         # The robot as the believed camera would see it.
         robot, _ = self.camera.depth_image(np.stack([*alone, true @ np.linalg.inv(believed)]), view)
         points = points_of(shot.depth, Intrinsics(*OPTICS.pinhole), 1.0).astype(np.float64)
         whose = np.where(bodies < 0, -1, np.maximum(bodies - self.links + 1, 0)).ravel()
         label = np.where(shot.source.ravel() >= 0, whose[shot.source.ravel()], -1)
-        return Seen(points @ believed[:3, :3].T + believed[:3, 3], label, shot.depth, robot)
+        return Seen(points @ believed[:3, :3].T + believed[:3, 3], label, bodies.ravel(), shot.depth, robot)
