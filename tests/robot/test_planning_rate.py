@@ -66,6 +66,6 @@ def test_nearly_all_poses_that_can_be_reached_are_planned_to_in_a_second(arm) ->
             states = [a + s[:, None] * (b - a) for a, b, s in zip(path[:-1], path[1:], shares, strict=True)]
             assert bare.free(np.concatenate(states)).all()
     print(f"\n{arm.name}: {len(seconds)} of {reachable} reachable in {SCENES} scenes, {np.median(seconds):.2f} s each")
-    assert reachable > 0.3 * SCENES  # the Panda is shorter
+    assert reachable > 0.15 * SCENES  # else the test tells little; the Panda, which is shorter, reaches fewer
     assert len(seconds) >= 0.98 * reachable
     assert np.median(seconds) < 1.0
