@@ -42,7 +42,7 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
         options.graph
         and not options.compile
         and isinstance(model, CloudNetwork)
-        and getattr(model.network, "FIXED_SHAPES", False)  # a network of the user's own may have any backbone
+        and getattr(getattr(model, "network", None), "FIXED_SHAPES", False)  # one of the user's own may have any layers
         and next(model.parameters()).is_cuda
     ):
         loss = GraphedLoss(model, loss)

@@ -16,6 +16,7 @@ from fb3d_rl.algos.setup import env_options, eval_entries, flow_policy_options, 
 from fb3d_rl.assets.options import AssetsOptions
 from fb3d_rl.assets.partnet_mobility import read_category
 from fb3d_rl.errors import UserError
+from fb3d_rl.models.artflownet import ArtFlowNet
 
 
 def test_mixed_objects_are_trained_on_and_only_real_ones_evaluated(tmp_path: Path, procedural_root: Path) -> None:
@@ -154,6 +155,7 @@ def test_the_mask_follows_from_the_network_unless_it_is_named(
 def test_a_network_that_reads_the_mask_is_not_evaluated_without(
     tmp_path: Path, config: Callable[[str, list[str]], Any]
 ) -> None:
-    cfg = config("evaluate", ["policy=artflownet", "checkpoint=pretrained", "policy.mask=none", "assets.eval_count=1"])
+    ArtFlowNet(neighbors=8).save_pretrained(path := tmp_path / "net.safetensors")  # one that was never without
+    cfg = config("evaluate", ["policy=artflownet", f"checkpoint={path}", "policy.mask=none", "assets.eval_count=1"])
     with pytest.raises(UserError, match=r"trained with the mask.*policy\.mask=target"):
         run_evaluation(cfg, tmp_path)
