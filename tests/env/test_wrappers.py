@@ -61,7 +61,7 @@ def driven() -> list[list[dict[str, Any]]]:
     return histories
 
 
-@pytest.fixture(params=["sync", "async"])
+@pytest.fixture(params=["sync", pytest.param("async", marks=pytest.mark.slow)])
 def vector(request: pytest.FixtureRequest) -> Iterator[Any]:
     """A maker of a vector of two."""
     made = []

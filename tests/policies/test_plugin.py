@@ -271,7 +271,7 @@ SMALL = ["experiment=smoke", "assets.categories=[Box]", "evaluation.trials=2", "
          "collector.workers=1"]  # fmt: skip
 
 
-@pytest.mark.parametrize("collector", ["direct", "process"])
+@pytest.mark.parametrize("collector", ["direct", pytest.param("process", marks=pytest.mark.slow)])
 def test_it_runs_the_same_trials_as_the_expert(folder: Path, config: Callable[..., Any], collector: str) -> None:
     words = [*SMALL, f"collector={collector}", "policy.target=my_policies:make", "evaluation.videos=1"]
     rows = run_evaluation(config("evaluate", words), folder / "run")
@@ -296,6 +296,7 @@ def test_tables_say_what_reads_the_truth(folder: Path, config: Callable[..., Any
     assert lengths[0] == lengths[1], "behind the wrapping it is the same policy"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "failure"), [("slow", "took_too_long"), ("later", "crashed")])
 def test_a_trial_that_fails_midway_costs_itself_alone(
     folder: Path, config: Callable[..., Any], name: str, failure: str

@@ -128,7 +128,7 @@ def test_the_average_follows_the_weights_and_is_what_remains() -> None:
     [
         pytest.param("pointnet2", "bf16", marks=pytest.mark.slow),
         ("delayed", "fp32"),
-        ("delayed", "bf16"),
+        pytest.param("delayed", "bf16", marks=pytest.mark.slow),
     ],
 )
 def test_two_hundred_steps_learn_one_cloud(
