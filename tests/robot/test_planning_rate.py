@@ -13,6 +13,7 @@ from fb3d_rl.robot.planning import plan
 from fb3d_rl.robot.timing import timed
 from fb3d_rl.robot.workspace import TABLE, cell
 
+
 def scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The noisy cloud [P, 3] of a box on the table of the cell, a point of it, and a flow some 15 degrees off the
     normal there: of the front, the top or a side.
