@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fb3d_rl.errors import UserError
-from fb3d_rl.perception.arrays import as_mask, as_points, near_origin, places
+from fb3d_rl.perception.arrays import as_mask, as_points, finite, near_origin, places
 from fb3d_rl.perception.bags import BAGS, is_bag, read_bag
 from fb3d_rl.perception.depth import points_of, read_depth, read_intrinsics
 from fb3d_rl.perception.records import Fields, read_pcd, read_ply
@@ -131,7 +131,7 @@ def read_cloud(
     if not len(points):
         raise UserError(f"{file} holds no points.")
     cleaned, _ = near_origin_of(file, points)
-    measured = cleaned.isfinite().all(1) & (points != 0).any(1)
+    measured = finite(cleaned) & (points.abs().sum(1) != 0)
     rows = places(measured).numpy()
     if len(rows) < 3:
         raise UserError(f"{file} holds {len(rows)} measured points: all others are zero or not finite.")

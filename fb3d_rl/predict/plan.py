@@ -18,7 +18,7 @@ from torch import Tensor
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import alignment, matrix_to_quaternion, quaternion_to_matrix, rotate
 from fb3d_rl.models.artflownet import LARGEST, POINTS, ArtFlowNet, needs_mask
-from fb3d_rl.perception.arrays import as_mask, as_points, draw, near_origin, nearest, places
+from fb3d_rl.perception.arrays import as_mask, as_points, draw, finite, near_origin, nearest, places
 from fb3d_rl.policies.commands import above_ground
 from fb3d_rl.policies.contact import choose_contact
 from fb3d_rl.policies.hand import hand_axis
@@ -133,7 +133,7 @@ def plan(
     given = as_points(points).cpu()
     marked = None if mask is None else as_mask(mask, len(given))
     near, origin = near_origin(given)
-    rows = places(near.isfinite().all(1))
+    rows = places(finite(near))
     if len(rows) < 3:
         raise UserError(f"The cloud has {len(rows)} points that are finite: nothing is to be seen.")
     kept = rows[draw(len(rows), LARGEST)]
@@ -193,9 +193,9 @@ def _to_all(
         whole = len(rows) == len(near)
         source = nearest(near if whole else near[rows], near[kept], sides if whole else sides[rows], sides[kept])
         if whole:
-            return flows[:, source], inside[source]
+            return flows.index_select(1, source), inside[source]
     everywhere = torch.zeros(len(flows), len(near), 3)
-    everywhere[:, rows] = flows[:, source]
+    everywhere[:, rows] = flows.index_select(1, source)
     shown = torch.zeros(len(near), dtype=torch.bool)
     shown[rows] = inside[source]
     return everywhere, shown

@@ -15,6 +15,9 @@ from fb3d_rl.predict.plan import Hypothesis, Plan
 PIECE = 1 << 16
 """Points that are written at a time: so many stay in the processor's cache."""
 
+ALL_FLOWS = 1_000_000
+"""Points of the largest cloud of which all hypotheses' flows are written, not that of the most probable one alone."""
+
 VECTORS = ("contact_point", "pull", "standoff", "precontact_point", "rotation", "quaternion")
 """What a hypothesis has besides its flow and its probability."""
 
@@ -57,11 +60,13 @@ def write_json(path: Path, plan: Plan, **about: object) -> None:
 
 
 def write_npz(path: Path, plan: Plan, **further: NDArray[Any]) -> None:
-    """Write points [N, 3], flow [N, 3], all flows [K, N, 3], probabilities [K], foreground [N], part [N] and others."""
+    """Write points [N, 3], flow [N, 3], probabilities [K], foreground [N], part [N] and others, and of at most
+    :data:`ALL_FLOWS` points all flows [K, N, 3].
+    """
     arrays: dict[str, Any] = {"points": plan.points, "flow": plan.hypotheses[0].flow, "foreground": plan.foreground}
     arrays |= further
     arrays["probabilities"] = np.array([one.probability for one in plan.hypotheses])
-    if len(plan.hypotheses) > 1:
+    if len(plan.hypotheses) > 1 and len(plan.points) <= ALL_FLOWS:
         arrays["flows"] = np.stack([one.flow for one in plan.hypotheses])
     if plan.part is not None:
         arrays["part"] = plan.part
