@@ -36,12 +36,17 @@ def sample(points, valid, chosen, n, count: tl.constexpr, block: tl.constexpr): 
         current = tl.argmax(distance, 0)
 
 
+def block_of(points: int) -> tuple[int, int]:
+    """The block that holds so many points, a power of two, and the warps that work on it."""
+    block = triton.next_power_of_2(points)
+    return block, min(8, max(1, block // 256))
+
+
 def farthest_point_sample(points: Tensor, count: int, valid: Tensor) -> Tensor:
     """As :func:`fb3d_rl.geometry.points.farthest_point_sample`, of clouds of at most :data:`LARGEST` points."""
     clouds, n = valid.shape
     chosen = torch.empty(clouds, count, dtype=torch.int64, device=points.device)
-    block = triton.next_power_of_2(n)
-    warps = min(8, max(1, block // 256))
+    block, warps = block_of(n)
     # Triton launches on the current device, which need not be the points'.
     with torch.cuda.device_of(points):
         sample[(clouds,)](points.float().contiguous(), valid.contiguous(), chosen, n, count, block, num_warps=warps)

@@ -14,8 +14,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-LARGEST = 8192
-"""Points of a cloud that the registers of one block hold."""
+from fb3d_rl.geometry.farthest_triton import block_of
 
 MOST_CENTRES = 1024
 """Points of a coarse cloud among which the three nearest are looked for."""
@@ -102,12 +101,12 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, count: int, valid
     m = centres.shape[1]
     index = torch.empty(clouds, m, count, dtype=torch.int64, device=points.device)
     sizes = torch.empty(clouds, m, dtype=torch.int32, device=points.device)
-    block = triton.next_power_of_2(n)
+    block, warps = block_of(n)
     given = (points.float().contiguous(), valid.contiguous(), centres.float().contiguous())
     with torch.cuda.device_of(points):  # Triton launches on the current device, which need not be the points'
         inside_balls[(clouds * m,)](
             *given, index, sizes, radius * radius, n, m, count, block, triton.next_power_of_2(count),
-            num_warps=min(8, max(1, block // 256)),
+            num_warps=warps,
         )  # fmt: skip
     return index, torch.arange(count, device=points.device) < sizes[..., None]
 

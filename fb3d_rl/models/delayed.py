@@ -66,7 +66,7 @@ class PooledAbstraction(nn.Module):
 @eager
 def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
     """Maximum of rows [P, C] over each ball, index [Q, K] of which mask [Q, K] is real (the first of a ball always), ->
-    [Q, C]; of a ball without any, that of its first slot.
+    [Q, C].
     """
     if rows.is_cuda and ops.has_triton():
         from fb3d_rl.geometry.neighbors_triton import largest_rows
@@ -74,8 +74,6 @@ def pooled_max(rows: Tensor, index: Tensor, mask: Tensor) -> Tensor:
         return largest_rows(rows, index)  # what the free slots hold is in the ball, too
     if rows.device.type != "cpu":
         return ops.take_rows(rows, index).amax(1)
-    mask = mask.clone()
-    mask[:, 0] = True
     # A product with a sparse matrix of ones whose sums are maxima: no [Q, K, C] array.
     starts = functional.pad(mask.sum(1).cumsum(0), (1, 0))
     ones = torch.ones(int(starts[-1]), dtype=rows.dtype)

@@ -92,12 +92,10 @@ class Level:
     @torch.no_grad()
     def balls(self, ratio: float, radius: float, neighbors: int) -> tuple[Level, Tensor, Tensor]:
         """Coarser points, and around each [Q] at most K of these points: their rows [Q, K], real where a mask [Q, K] is
-        (first in each row; the other slots repeat the first). Nothing is in the balls of padding.
+        (first in each row; the other slots repeat the first).
         """
         coarse = self.coarser(ratio)
         index, mask = ops.ball_query(self.points, coarse.points, radius, neighbors, self.valid)
-        if self.present is not None:
-            mask &= coarse.valid[..., None]
         rows = self.row.gather(1, index.flatten(1)).view_as(index)
         return coarse, coarse.flat(rows), coarse.flat(mask)
 
