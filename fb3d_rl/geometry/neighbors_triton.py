@@ -96,7 +96,9 @@ def largest(rows, index, best, winner, channels, most: tl.constexpr, block: tl.c
 
 
 def ball_query(points: Tensor, centres: Tensor, radius: float, count: int, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`fb3d_rl.geometry.points.ball_query`, of clouds of at most :data:`LARGEST` points."""
+    """As :func:`fb3d_rl.geometry.points.ball_query`, of clouds of at most
+    :data:`fb3d_rl.geometry.farthest_triton.LARGEST` points.
+    """
     clouds, n = valid.shape
     m = centres.shape[1]
     index = torch.empty(clouds, m, count, dtype=torch.int64, device=points.device)

@@ -100,9 +100,9 @@ def ball_query(
     """
     valid = _all_valid(points, valid)
     if points.is_cuda and has_triton():
-        from fb3d_rl.geometry import neighbors_triton
+        from fb3d_rl.geometry import farthest_triton, neighbors_triton
 
-        if points.shape[1] <= neighbors_triton.LARGEST:
+        if points.shape[1] <= farthest_triton.LARGEST:
             return neighbors_triton.ball_query(points, centres, radius, count, valid)
     batch, rows = centres.shape[:2]
     inside_so_far = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
