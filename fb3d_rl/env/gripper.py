@@ -64,6 +64,28 @@ class FloatingSuctionGripper(BaseAgent):
             )
         }
 
+    def set_action(self, action: Any) -> None:
+        """As ManiSkill's, but one environment on the CPU gives the drives numbers, without a tensor for each joint.
+
+        Args:
+            action: [E, 8] in [-1, 1]: each joint's velocity as a share of its largest.
+        """
+        if self.scene.gpu_sim_enabled:
+            super().set_action(action)
+            return
+        shares = np.asarray(action, dtype=np.float32)[0]
+        if np.isnan(shares).any():
+            raise ValueError(f"the action holds a number that is missing: {shares}")
+        targets = self._middle + self._reach * shares.clip(-1.0, 1.0)
+        for joint, target in zip(self._drives, targets.tolist(), strict=True):
+            joint.set_drive_velocity_target(target)
+
+    def _after_init(self) -> None:
+        velocity = self.controllers["velocity"]
+        low, high = (np.asarray(bound, dtype=np.float32) for bound in (velocity.config.lower, velocity.config.upper))
+        self._middle, self._reach = np.float32(0.5) * (high + low), np.float32(0.5) * (high - low)
+        self._drives = [joint._objs[0] for joint in velocity.joints]
+
     def tool_pose(self) -> Tensor:
         """Pose [E, 7] of the suction tip in the world: p (m) and q (wxyz, w >= 0)."""
         poses = [body.entity_pose for body in self.robot.links_map[TOOL]._objs]

@@ -27,8 +27,8 @@ def gripper_and_joint(
     stages: Sequence[Stage],
     poses: Sequence[NDArray[np.float64]],
     gripper: FloatingSuctionGripper,
-    force: Tensor,
-    position: Tensor,
+    force: NDArray[np.float32],
+    position: NDArray[np.float32],
 ) -> Observation:
     """State of the grippers, and the true joints to open.
 
@@ -41,7 +41,7 @@ def gripper_and_joint(
     """
 
     def tensor(rows: Any) -> Tensor:
-        return torch.from_numpy(np.array(rows)).to(force.device)
+        return torch.from_numpy(np.array(rows)).to(gripper.device)
 
     truth = tensor([stage.joint_truth(pose) for stage, pose in zip(stages, poses, strict=True)])
     return {
@@ -50,7 +50,7 @@ def gripper_and_joint(
             "qvel": gripper.robot.get_qvel(),
             "tool_pose": gripper.tool_pose(),
             "attached": tensor([[stage.suction.attached] for stage in stages]),
-            "contact_force": force.clone(),
+            "contact_force": tensor(force),
             "camera_position": tensor([stage.camera_pose[:3, 3] for stage in stages]).float(),
             "goal_sense": tensor([[stage.sense] for stage in stages]).float(),
         },
@@ -58,7 +58,7 @@ def gripper_and_joint(
             "joint_axis": truth[:, :3],
             "joint_origin": truth[:, 3:],
             "joint_prismatic": tensor([[stage.prismatic] for stage in stages]),
-            "joint_position": position,
+            "joint_position": tensor(position),
         },
     }
 

@@ -86,13 +86,22 @@ class StagedEnv(BaseEnv):
         self.articulation = Articulation.merge(built, name="object")
         self.add_to_state_dict_registry(self.articulation)
         joints = max(len(stage.order) for stage in self.stages)
-        self._columns = torch.zeros(self.num_envs, joints, dtype=torch.int64, device=self.device)
+        self._rows, self._columns = np.arange(self.num_envs)[:, None], np.zeros((self.num_envs, joints), dtype=np.int64)
         for row, stage in zip(self._columns, self.stages, strict=True):
-            row[: len(stage.order)] = torch.tensor(stage.order)
+            row[: len(stage.order)] = stage.order
+
+    def joint_states(self) -> NDArray[np.float32]:
+        """Joint states [E, J] (rad or m) in the order of each object's ``movable``, padded on the right."""
+        if self.gpu_sim_enabled:
+            states = self.articulation.get_qpos().cpu().numpy()
+        else:
+            states = self.articulation._objs[0].get_qpos()[None]
+        found: NDArray[np.float32] = states[self._rows, self._columns]
+        return found
 
     def joint_positions(self) -> Tensor:
-        """Joint states [E, J] (rad or m) in the order of each object's ``movable``, padded on the right."""
-        return self.articulation.get_qpos().gather(1, self._columns)
+        """:meth:`joint_states` as a tensor on the environments' device."""
+        return torch.from_numpy(self.joint_states()).to(self.device)
 
     def contact_impulses(self) -> ContactImpulses:
         """A reader of the contacts of all environments for simulators without contact points."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -109,6 +110,7 @@ class Suction:
         self.options = options
         self.held: int | None = None
         self.anchors: tuple[Vector, Vector] = (np.zeros(3), np.zeros(3))
+        self._ends = np.zeros((2, 4))  # the anchors as homogeneous coordinates
         self._scene, self._tool = scene, tool
         self._fingers, self._body = frozenset(fingers), frozenset(body)
         self._parts = dict(parts)
@@ -126,13 +128,15 @@ class Suction:
         """Length of the spring, m (0 while nothing is held)."""
         if self.held is None:
             return 0.0
-        on_tool = _to_world(self._tool.entity_pose, self.anchors[0])
-        on_part = _to_world(self._parts[self.held].entity_pose, self.anchors[1])
-        return float(np.linalg.norm(on_tool - on_part))
+        on_tool = self._tool.entity_pose.to_transformation_matrix() @ self._ends[0]
+        between = (on_tool - self._parts[self.held].entity_pose.to_transformation_matrix() @ self._ends[1])[:3]
+        return math.sqrt(between.dot(between))
 
     def contacts(self) -> Contacts:
         """The contacts of the physics step that was just made, where the simulator gives points (on the CPU)."""
-        contacts = Contacts(np.zeros(3), {})
+        impulses: list[Vector] = []
+        signs: list[float] = []
+        touched: dict[int, list[Vector]] = {}
         for contact in self._scene.physx_system.get_contacts():
             first, second = contact.bodies
             if first in self._body:
@@ -142,23 +146,29 @@ class Suction:
             else:
                 continue
             points = contact.points
-            for point in points:
-                contacts.impulse += sign * point.impulse
+            impulses.extend([point.impulse for point in points])
+            signs.extend([sign] * len(points))
             number = self._numbers.get(other)
             if number is not None and own in self._fingers and not self.attached:
                 touches = self._touches(points)
                 if touches:
-                    contacts.touches.setdefault(number, []).extend(touches)
-        return contacts
+                    touched.setdefault(number, []).extend(touches)
+        if not impulses:
+            return Contacts(np.zeros(3), touched)
+        return Contacts((np.array(impulses, dtype=np.float64) * np.array(signs)[:, None]).sum(0), touched)
 
-    def update(self, contacts: Contacts) -> None:
-        """Hold, keep or lose a part after a physics step with these contacts."""
+    def update(self, contacts: Contacts) -> bool:
+        """Hold, keep or lose a part after a physics step with these contacts.
+
+        Returns:
+            Whether a part is held that was not before.
+        """
         self._impulse += contacts.impulse
         if self.attached:
             stretch = self.stretch
             if stretch > self.options.max_stretch or stretch * self.options.stiffness > self.options.breaking_force:
                 self.release()
-            return
+            return False
         touches = contacts.touches
         if touches:
             # The part with the touch nearest to the tip's centre; ties go to the lower number.
@@ -170,6 +180,7 @@ class Suction:
                 _to_local(self._tool.entity_pose, where),
                 _to_local(self._parts[number].entity_pose, where),
             )
+        return self.attached
 
     def _touches(self, points: Sequence[PhysxContactPoint]) -> list[Vector]:
         tip = np.asarray(self._tool.entity_pose.p, dtype=np.float64)
@@ -191,6 +202,7 @@ class Suction:
             set_axis(self.options.stiffness, self.options.damping)
         drive.set_drive_property_slerp(0.0, self.options.angular_damping)
         self._drive, self.held, self.anchors = drive, number, (on_tool, on_part)
+        self._ends = np.column_stack([self.anchors, np.ones(2)])
 
     def release(self) -> None:
         """Let go of the part, if one is held."""
@@ -214,10 +226,6 @@ class Suction:
         """Net contact impulse [3] on the gripper (N s, world) since the last call."""
         impulse, self._impulse = self._impulse, np.zeros(3)
         return impulse
-
-
-def _to_world(pose: sapien.Pose, point: Vector) -> Vector:
-    return np.asarray(pose.to_transformation_matrix() @ np.append(point, 1.0))[:3]
 
 
 def _to_local(pose: sapien.Pose, point: Vector) -> Vector:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -196,7 +197,7 @@ class OpenArticulatedEnv(StagedEnv):
         if len(which) == self.num_envs:
             envs, joints = self._columns.shape
             self._progress = Progress(envs, joints, self.options.success, self.device)
-            self._force = torch.zeros(envs, 1, device=self.device)
+            self._force = np.zeros((envs, 1), dtype=np.float32)  # norm of the contact force on each gripper, N
         state = torch.zeros(len(which), int(self.articulation.max_dof))
         hand = torch.zeros(len(which), ACTION_DIM)
         for row, e in enumerate(which):
@@ -236,16 +237,17 @@ class OpenArticulatedEnv(StagedEnv):
         else:
             contacts = [stage.suction.contacts() for stage in self.stages]
         for e, stage in enumerate(self.stages):
-            stage.suction.update(contacts[e])
-            self._progress.hold(e, stage)
+            if stage.suction.update(contacts[e]):
+                self._progress.hold(e, stage)
 
     def _after_control_step(self) -> None:
         for e, stage in enumerate(self.stages):
-            self._force[e] = float(np.linalg.norm(stage.suction.take_impulse())) / self.control_timestep
+            impulse = stage.suction.take_impulse()
+            self._force[e] = math.sqrt(impulse.dot(impulse)) / self.control_timestep
 
     def evaluate(self) -> dict[str, Tensor]:
         """The metrics (:meth:`fb3d_rl.env.progress.Progress.metrics`)."""
-        return self._progress.metrics(self.joint_positions())
+        return self._progress.metrics(self.joint_states())
 
     def get_info(self) -> dict[str, Any]:
         """ManiSkill's, with a copy of the count of steps, which ManiSkill changes in place."""
@@ -266,7 +268,7 @@ class OpenArticulatedEnv(StagedEnv):
         if self._obs_mode == "none":
             return {}
         poses = [stage.poses() for stage in self.stages]
-        position = self.joint_positions().gather(1, self._progress.target)
+        position = self._progress.of_target(self.joint_states())
         obs = gripper_and_joint(self.stages, poses, self.agent, self._force, position)
         rendered = self._obs_mode == "pointcloud" and self.options.camera.kind == "sapien"
         if rendered or self._obs_mode == "rgbd":
@@ -287,7 +289,8 @@ class OpenArticulatedEnv(StagedEnv):
         state: dict[str, Any] = super().get_state_dict()
         springs = np.stack([stage.suction.state for stage in self.stages])
         state["suction"] = torch.as_tensor(springs, dtype=torch.float32, device=self.device)
-        state["episode"] = torch.cat([self._elapsed_steps[:, None], self._force, self._progress.held], dim=-1)
+        episode = np.concatenate([self._force, self._progress.held], axis=1, dtype=np.float32)
+        state["episode"] = torch.cat([self._elapsed_steps[:, None], torch.from_numpy(episode).to(self.device)], dim=1)
         return state
 
     def set_state_dict(self, state: dict[str, Any], env_idx: Tensor | None = None) -> None:
@@ -305,7 +308,7 @@ class OpenArticulatedEnv(StagedEnv):
             self.stages[e].suction.restore(state["suction"][row].double().cpu().numpy())
             elapsed, force, held_before = state["episode"][row].tensor_split([1, 2])
             self._elapsed_steps[e] = elapsed[0].to(self._elapsed_steps.dtype)
-            self._force[e], self._progress.held[e] = force, held_before.bool()
+            self._force[e], self._progress.held[e] = float(force), held_before.bool().cpu().numpy()
 
     def set_state(self, state: Tensor, env_idx: Tensor | None = None) -> None:
         """Restore a flat state [E, D] of ``get_state()``, taken in the same trials."""

@@ -69,3 +69,20 @@ def test_gripper_floats_and_its_fingers_stay_closed(env: OpenArticulatedEnv) -> 
         obs, *_ = env.step(torch.zeros(1, 8))
     torch.testing.assert_close(obs["observation"]["qpos"], before, atol=1e-5, rtol=0)
     assert np.allclose(obs["observation"]["contact_force"], 0.0)
+
+
+def test_drives_get_the_numbers_that_maniskill_gives_them(env: OpenArticulatedEnv) -> None:
+    drives = [joint._objs[0] for joint in env.agent.robot.active_joints]
+
+    def targets() -> list[float]:
+        return [float(drive.drive_velocity_target.item()) for drive in drives]
+
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        action = 2.4 * torch.rand(1, 8, generator=generator) - 1.2  # some of it out of range
+        env.agent.controller.set_action(action)
+        expected = targets()
+        env.agent.set_action(torch.zeros(1, 8))
+        assert targets() == [0.0] * 8
+        env.agent.set_action(action)
+        assert targets() == expected
