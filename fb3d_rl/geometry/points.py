@@ -2,8 +2,9 @@
 
 Shapes: B clouds, N points each, M centres, K neighbours. ``valid`` is False on padding: a padding point is
 never sampled, grouped or interpolated from. All runs on CPU and CUDA in shapes that do not depend on the points, and
-gives the same bits every time on a CPU. It is plain PyTorch but for sampling and neighbours on CUDA
-(:mod:`fb3d_rl.geometry.farthest_triton`, :mod:`fb3d_rl.geometry.neighbors_triton`).
+gives the same bits every time on a CPU. It is plain PyTorch but for sampling and neighbours: with NumPy on a CPU
+(:mod:`fb3d_rl.geometry.points_cpu`), with Triton on CUDA (:mod:`fb3d_rl.geometry.farthest_triton`,
+:mod:`fb3d_rl.geometry.neighbors_triton`).
 """
 
 from __future__ import annotations
@@ -59,6 +60,15 @@ def farthest_point_sample(points: Tensor, count: int, valid: Tensor | None = Non
 
         if points.shape[1] <= farthest_triton.LARGEST:
             return farthest_triton.farthest_point_sample(points, count, valid)
+    if points.device.type == "cpu":
+        from fb3d_rl.geometry import points_cpu
+
+        if len(points) <= points_cpu.FEW and points.dtype == torch.float32:
+            return points_cpu.farthest_point_sample(points, count, valid)
+    return _farthest_plain(points, count, valid)
+
+
+def _farthest_plain(points: Tensor, count: int, valid: Tensor) -> Tensor:
     coordinates = points.permute(2, 0, 1).contiguous()
     distance = torch.full(points.shape[:2], torch.inf, device=points.device, dtype=points.dtype)
     distance.masked_fill_(~valid, -1.0)
@@ -104,16 +114,18 @@ def ball_query(
 
         if points.shape[1] <= farthest_triton.LARGEST:
             return neighbors_triton.ball_query(points, centres, radius, count, valid)
-    batch, rows = centres.shape[:2]
-    inside_so_far = torch.empty(batch, rows, points.shape[1], dtype=torch.int32, device=points.device)
-    # One cloud at a time on a CPU, so that its distances stay in the cache.
-    size = 1 if points.device.type == "cpu" else batch
-    for start in range(0, batch, size):
-        part = slice(start, start + size)
-        inside = squared_distances(centres[part], points[part]) <= radius * radius
-        torch.cumsum(inside & valid[part, None], 2, dtype=torch.int32, out=inside_so_far[part])
+    if points.device.type == "cpu":
+        from fb3d_rl.geometry import points_cpu
+
+        return points_cpu.ball_query(points, centres, radius, count, valid)
+    return _balls_plain(points, centres, radius, count, valid)
+
+
+def _balls_plain(points: Tensor, centres: Tensor, radius: float, count: int, valid: Tensor) -> tuple[Tensor, Tensor]:
+    inside = (squared_distances(centres, points) <= radius * radius) & valid[:, None]
+    inside_so_far = torch.cumsum(inside, 2, dtype=torch.int32)
     # The k-th neighbour is the point at which the number of points inside first reaches k.
-    rank = torch.arange(1, count + 1, dtype=torch.int32, device=points.device).repeat(batch, rows, 1)
+    rank = torch.arange(1, count + 1, dtype=torch.int32, device=points.device).repeat(*centres.shape[:2], 1)
     mask = rank <= inside_so_far[..., -1:]
     index = torch.searchsorted(inside_so_far, rank)
     first = index[..., :1] * mask[..., :1]

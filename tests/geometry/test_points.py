@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from fb3d_rl.geometry import points as ops
+from fb3d_rl.geometry import points_cpu
 
 
 def make_clouds() -> tuple[torch.Tensor, torch.Tensor]:
@@ -42,6 +43,26 @@ def test_what_was_sampled_first_is_what_sampling_again_would_choose() -> None:
     once = ops.gather(points, ops.farthest_point_sample(points, 40, valid))
     again = ops.gather(once, ops.farthest_point_sample(once, 15))
     assert torch.equal(again, once[:, :15])
+
+
+def test_a_cpu_samples_and_groups_as_plain_pytorch_does_to_the_last_index() -> None:
+    generator = torch.Generator().manual_seed(5)
+    for number in range(40):
+        batch, n = (1, 4)[number % 2], int(torch.randint(60, 900, (), generator=generator))
+        points = torch.randn(batch, n, 3, generator=generator)
+        if number % 4 > 1:
+            points = points.mul(8).round() / 10  # many distances are equal but for rounding
+        valid = torch.rand(batch, n, generator=generator) < (0.9, 0.02)[number % 3 == 0]
+        valid[-1] &= number % 5 > 0
+        chosen = points_cpu.farthest_point_sample(points, n // 3, valid)
+        assert torch.equal(chosen, ops._farthest_plain(points, n // 3, valid))
+        centres = ops.gather(points, chosen) + 3.0 * (number % 7 == 0)
+        for answer, plain in zip(
+            points_cpu.ball_query(points, centres, 0.6, 17, valid),
+            ops._balls_plain(points, centres, 0.6, 17, valid),
+            strict=True,
+        ):
+            assert torch.equal(answer, plain)
 
 
 def test_ball_query_keeps_the_first_valid_points_by_index() -> None:
