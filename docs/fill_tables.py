@@ -351,11 +351,77 @@ def pretrained() -> Lines:
     return table(head, body)
 
 
+ABLATION = {
+    "first edition: `pointnet2`, 57,600 clouds, one answer; as predicted": (
+        "touch/without/real",
+        "touch/without/doors",
+    ),
+    "with touch": ("touch/with/real", "touch/with/doors"),
+    "`delayed`, 200,000 clouds of nearly the same objects; with touch": ("ablation/clouds", "ablation/clouds_doors"),
+    "mechanisms, look-alike doors, 68 real objects of other kinds; four answers; 200,000 clouds; with touch": (
+        "ablation/answers",
+        "ablation/answers_doors",
+    ),
+    "second edition: the same with 1.3 million clouds; with touch": ("second_edition/seed0", "second_edition/doors"),
+    "second edition, as predicted": ("ablation/without_touch", "ablation/without_touch_doors"),
+}
+"""What was added, one by one, and the runs on real objects and on look-alike doors."""
+
+
+def ablation() -> Lines:
+    """Success on real objects and on look-alike doors after each addition."""
+    body = []
+    for name, (real, doors) in ABLATION.items():
+        if not (RESULTS / real / "summary.json").is_file():  # not yet measured
+            continue
+        numbers = summary(real)
+        several = numbers.get("flow/best_cosine", 0.0) > numbers["flow/cosine"] + 1e-6
+        body.append([
+            name,
+            _two_means(numbers, "flow/cosine"),
+            _two_means(numbers, "flow/best_cosine") if several else "",
+            share("success_rate")(Row(name, real, "artflownet")),
+            percent(numbers["artflownet/success_rate_class_mean"]),
+            share("success_rate")(Row(name, doors, "artflownet")) if (RESULTS / doors).is_dir() else "",
+        ])  # fmt: skip
+    return table(["", "flow cosine", "best answer", "opened", "opened, class mean", "look-alike doors"], body)
+
+
+def _logged(name: str) -> list[dict[str, float]]:
+    """The rows of a training's log that hold a validation."""
+    rows = [json.loads(line) for line in (RESULTS / "learning_curve" / f"{name}.jsonl").read_text().splitlines()]
+    return [row for row in rows if "val/cosine" in row]
+
+
+def learning_curve() -> Lines:
+    """Flow after so many clouds of the first edition's data, as the training's log has it."""
+    body = []
+    for row in _logged("delayed"):
+        cells = [
+            f"{plain(row[f'val/{split}/cosine'])}, {plain(row[f'val/{split}/rmse'])}"
+            for split in ("train_train", "train_test", "test")
+        ]
+        body.append([f"{32 * int(row['step']):,}", *cells])
+    return table(["clouds", "validation", "train_test", "test"], body)
+
+
+def learning_curve_seeds() -> Lines:
+    """Validation of the second edition's three trainings, with the learning rate."""
+    runs = [_logged(f"gpu/seed{seed}") for seed in range(3)]
+    body = [
+        [f"{256 * int(rows[0]['step']):,}", *(f"{plain(r['val/cosine'])}, {plain(r['val/rmse'])}" for r in rows)]
+        for rows in zip(*runs, strict=True)
+        if int(rows[0]["step"]) % 800 == 0 or rows[0]["step"] >= 4000
+    ]
+    return table(["clouds", "seed 0", "seed 1", "seed 2"], body)
+
+
 TABLES: dict[str, Callable[[], Lines]] = {
     function.__name__: function
     for function in (
         headline, imitation, imitation_unseen, imitation_partnet_mobility, comparison, procedural, partnet_mobility,
-        flow_published, transfer, transfer_categories, pretrained, touch,
+        flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
+        learning_curve_seeds,
     )
 }  # fmt: skip
 
