@@ -29,6 +29,7 @@ from fb3d_rl.algos.learners import (
     flow_network,
     imitation_objective,
     learner_options,
+    members,
     networks,
     new_gate,
     new_learner,
@@ -270,6 +271,9 @@ class Run:
             done.fit, done.log_rows = state, log.rows
             self.save()
 
+        if number == 0:  # later on it would change what the weights mean
+            for member in members(self.learner):
+                member.network.normalize(self.buffer[torch.arange(len(self.buffer))]["expert", "twist"])
         nets = networks(self.learner).to(self.protocol.device)
         objective = imitation_objective(self.learner, self.algo, options.seed)
         labels = Labels(self.buffer, self.algo.learner.chunk)
@@ -367,7 +371,8 @@ def round_beta(algo: ImitationOptions, number: int) -> float:
 def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> RowsOptions:
     """What a row of the buffer holds."""
     state = gate.initial_state(torch.Size([1])).keys(include_nested=True, leaves_only=True)
-    further: list[Key] = list(state) if algo.gate.budget is not None else []
+    draws: list[Key] = ["seed"] if algo.learner.draws else []
+    further = [*state, *draws] if algo.gate.budget is not None else []
     return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], tuple(further), algo.oracle)
 
 

@@ -92,8 +92,7 @@ class ImitationOptions(OptimizerOptions, AlgoOptions):
     validate_trials: int = option(
         0, "trials with validation objects after each round, for the learning curve", within="[0, inf)"
     )
-    loss: Literal["l1", "l2", "smooth_l1"] = option(
-        "l1", "loss of a deterministic head; a Gaussian head has its likelihood"
-    )
+    loss: Literal["l1", "l2", "smooth_l1"] = option("l1", "loss of a deterministic head; the others have their own")
+    kl_weight: float = option(10.0, "of head=act: weight of its latent's divergence from a normal", within="[0, inf)")
     turn: float = option(15.0, "inputs are rotated about z by a random angle of at most this", "degrees", "[0, inf)")
     mirror: bool = option(True, "mirror inputs with probability 1/2")
