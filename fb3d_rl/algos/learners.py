@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.flow_policy import FlowPolicy
@@ -26,7 +27,7 @@ from fb3d_rl.training.draws import generator, global_draws
 from fb3d_rl.training.objective import Objective
 
 if TYPE_CHECKING:
-    from fb3d_rl.algos.options import ImitationOptions
+    from fb3d_rl.algos.options import ImitationOptions, SamplingOptions
 
 TURN, NOISE = 4, 9
 """Purposes of random draws; see :func:`fb3d_rl.training.draws.generator`."""
@@ -36,26 +37,61 @@ class Labels:
     """The buffer's rows for the loss: with "twist", the expert's twists of the next ``chunk`` steps, and "is_pad".
 
     Where the episode ends earlier, the twists are padded; the loss leaves the padding out.
+
+    Args:
+        buffer: the rows.
+        chunk: see above.
+        drawn: numbers of the rows to learn from, as :func:`drawn_rows` gives them; None for each of them once.
     """
 
-    def __init__(self, buffer: DemonstrationBuffer, chunk: int) -> None:
-        self._buffer, self._chunk = buffer, chunk
+    def __init__(self, buffer: DemonstrationBuffer, chunk: int, drawn: Tensor | None = None) -> None:
+        self._buffer, self._chunk, self._drawn = buffer, chunk, drawn
 
     def __len__(self) -> int:
-        return len(self._buffer)
+        return len(self._buffer) if self._drawn is None else len(self._drawn)
 
     def __getitem__(self, index: Index) -> TensorDictBase:
         return pick(index, len(self), self._take)
 
     def _take(self, index: Tensor) -> TensorDictBase:
+        index = index if self._drawn is None else self._drawn[index]
         rows = self._buffer[index]
         steps = torch.arange(self._chunk)
-        ahead = (index[:, None] + steps).clamp(max=len(self) - 1)
+        ahead = (index[:, None] + steps).clamp(max=len(self._buffer) - 1)
         later = rows[:, None] if self._chunk == 1 else self._buffer[ahead.flatten()].view(len(index), self._chunk)
         rows["twist"] = later["expert", "twist"]
         follows = later["elapsed_steps"].squeeze(-1) == rows["elapsed_steps"] + steps
         rows["is_pad"] = ~(follows & (later["episode"].squeeze(-1) == rows["episode"]))
         return rows
+
+
+def drawn_rows(buffer: DemonstrationBuffer, options: SamplingOptions, number: int) -> Tensor | None:
+    """Numbers of the rows that round ``number`` learns from, those of larger weight more often; None for all rows.
+
+    There are as many numbers as rows that count; how often each of them comes is its share, rounded up or down.
+
+    Raises:
+        UserError: no row counts.
+    """
+    if options.rows == "all" and options.expert == options.learner:
+        return None
+    weights = []
+    for episode, info in enumerate(buffer.episodes):
+        counts = {
+            "all": True,
+            "recent": info.round > number - options.rounds,
+            "successes": info.success,
+        }[options.rows]
+        acts = buffer.frames(episode)["expert", "acts"].flatten()
+        weights.append(torch.where(acts, options.expert, options.learner).double() * counts)
+    weight = torch.cat(weights)
+    total, count = weight.sum(), int((weight > 0).sum())
+    if not count:
+        raise UserError(
+            f"algo.sampling.rows={options.rows} leaves no label to learn from in round {number + 1}; choose another, "
+            "or give algo.sampling.expert and algo.sampling.learner more than 0"
+        )
+    return torch.searchsorted(weight.cumsum(0) / total, (torch.arange(count) + 0.5) / count)
 
 
 def new_learner(
