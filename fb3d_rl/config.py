@@ -205,8 +205,11 @@ def _validate_imitation(algo: ImitationOptions, collector: CollectorOptions, lab
         raise UserError(f"algo.gate.budget={gate.budget} sets nothing of algo.gate.name={gate.name}; leave it null")
     if gate.name in COMPARING and algo.members < 2:
         raise UserError(f"algo.gate.name={gate.name} compares learners; give algo.members=2 or more")
-    if learner.head == "gaussian" and learner.chunk > 1:
-        raise UserError("algo.learner.head=gaussian has a likelihood for algo.learner.chunk=1 only")
+    if algo.members > 1 and (learner.execute > 1 or learner.ensemble is not None):
+        raise UserError(
+            f"algo.members={algo.members} learners would each go on with plans of their own; leave "
+            "algo.learner.execute=1 and algo.learner.ensemble=null"
+        )
     if (learner.flow == "artflownet") != bool(algo.flow_checkpoint):
         raise UserError(
             "algo.learner.flow=artflownet and algo.flow_checkpoint=PATH, a checkpoint of algo=artflownet, go together"

@@ -30,6 +30,7 @@ class About:
         within: range of the number as an interval, such as "[0, 1)" or "(0, inf)"; "" for any.
         null: the meaning of null in a configuration; "" if null is not allowed.
         among: the registry that holds the allowed values, if there is one; entries that are added later count too.
+        later: whether the field came after policies had been published, whose digests its default does not change.
     """
 
     help: str
@@ -37,16 +38,28 @@ class About:
     within: str = ""
     null: str = ""
     among: Collection[str] = ()
+    later: bool = False
 
 
 def option(
-    default: Any, help: str, unit: str = "", within: str = "", null: str = "", among: Collection[str] = ()
+    default: Any,
+    help: str,
+    unit: str = "",
+    within: str = "",
+    null: str = "",
+    among: Collection[str] = (),
+    later: bool = False,
 ) -> Any:
     """A field that is a key of the configuration; see :class:`About`."""
-    about = {_KEY: About(help, unit, within, null, among)}
+    about = {_KEY: About(help, unit, within, null, among, later)}
     if isinstance(default, list | dict):
         return field(default_factory=lambda: type(default)(default), metadata=about)
     return field(default=default, metadata=about)
+
+
+def came_later(item: Field[Any], value: Any) -> bool:
+    """Whether a field came later (:class:`About`) and has its default."""
+    return item.metadata.get(_KEY, About("")).later and value == item.default
 
 
 def group(kind: type) -> Any:

@@ -276,6 +276,7 @@ def _detail(buffer: DemonstrationBuffer, episode: int) -> Table:
         "outcome": f"{'success' if info.success else 'failure'}, normalized distance {info.normalized_distance:.3f}",
         "steps": f"{info.steps}, of which {info.rows} are kept in rows {first} to {first + info.rows - 1}",
         "expert acts": f"in {100 * frames['expert', 'acts'].float().mean():.0f} % of the steps",
+        "who acted": _who_acted(frames["expert", "acts"].flatten().tolist()),
         "holds": f"from step {held[0]} on, in {len(held)} steps" if held else "never",
     }
     table = Table(title=f"{buffer.path}, episode {episode}", box=None, show_header=False)
@@ -285,6 +286,13 @@ def _detail(buffer: DemonstrationBuffer, episode: int) -> Table:
         name = ".".join(key) if isinstance(key, tuple) else key
         table.add_row(name, f"{list(shape)} {str(dtype).removeprefix('torch.')}", style="dim")
     return table
+
+
+def _who_acted(expert: list[bool], width: int = 60) -> str:
+    """Who acted along an episode, in at most ``width`` letters: E the expert, L the learner, x both."""
+    count = min(width, len(expert))
+    parts = [expert[len(expert) * k // count : len(expert) * (k + 1) // count] for k in range(count)]
+    return "".join("E" if all(part) else "x" if any(part) else "L" for part in parts)
 
 
 def _print(table: Table) -> None:

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 
 from fb3d_rl.contract import Key
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
@@ -55,6 +55,8 @@ def collect(
     samples: SampleOptions,
     rows: RowsOptions,
     number: int,
+    beta: float,
+    version: int,
     labels: int,
     rng: np.random.Generator,
     progress: Callable[[int], None] = lambda labels: None,
@@ -67,6 +69,8 @@ def collect(
         samples: how clouds and views are drawn.
         rows: what a row holds.
         number: the number of the round.
+        beta: see :func:`fb3d_rl.data.demonstrations.recorded`.
+        version: likewise.
         labels: how many labels to collect.
         rng: the generator that draws the trials.
         progress: called with the number of labels so far.
@@ -100,7 +104,7 @@ def collect(
                 barren = 0
             if count < labels and len(frames):
                 kept = frames[: labels - count]
-                episodes.append((kept, info))
+                episodes.append((recorded(kept, info, beta, version), info))
                 count += len(kept)
         if barren >= BARREN:
             raise UserError(f"the last {barren} trials gave no label: {rows.why_none(len(outcomes), error)}")
@@ -145,7 +149,7 @@ class RowsOptions:
         limits: the velocities of action 1.
         history: number of earlier steps in the learner's input.
         flow: the key of the flow in the learner's input, if there is one.
-        further: keys from which a gate's thresholds are set.
+        further: what a gate compares and remembers, and keys from which its thresholds are set.
         attached_only: whether only steps in which suction holds a part become rows.
     """
 
@@ -187,7 +191,9 @@ def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer
     if lacking:
         raise UserError(f"the demonstrations at {source.path} lack {', '.join(map(str, lacking))}; record them anew")
     for episode, info in enumerate(source.episodes):
-        target.extend(rows.of(source.frames(episode)), info)
+        frames = source.frames(episode)
+        kept = rows.of(frames).update(frames.select("record", strict=False))
+        target.extend(recorded(kept, info, beta=1.0, version=-1), info)
 
 
 def relabelled(rows: TensorDictBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:

@@ -26,9 +26,11 @@ from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstra
 from fb3d_rl.algos.learners import (
     Labels,
     acting_policy,
+    drawn_rows,
     flow_network,
     imitation_objective,
     learner_options,
+    members,
     networks,
     new_gate,
     new_learner,
@@ -49,6 +51,7 @@ from fb3d_rl.policies.learner import FLOW_KEYS
 from fb3d_rl.policies.options import FlowPolicyOptions, LearnerOptions
 from fb3d_rl.registry import REGISTRY
 from fb3d_rl.rollout.collectors import Workers
+from fb3d_rl.rollout.demonstrations import Assets, recipe
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
 from fb3d_rl.rollout.trials import schedule
@@ -145,7 +148,9 @@ class Run:
         if self.cfg.resume:
             shutil.rmtree(self.out / BUFFER, ignore_errors=True)
         rows = self.cfg.data.labels + (len(given) if given else 0)
-        buffer = DemonstrationBuffer.create(self.out / BUFFER, rows)
+        root = self.cfg.assets.root if self.cfg.assets.source == "partnet_mobility" else str(self.out / "objects")
+        about = recipe(self.protocol.env, Assets(root=root))
+        buffer = DemonstrationBuffer.create(self.out / BUFFER, rows, about)
         if given is not None:
             copy_demonstrations(given, buffer, self.rows)
         buffer.commit()
@@ -223,7 +228,9 @@ class Run:
                 task = bar.add_task(f"round {number + 1} of {algo.rounds}: labels", total=labels)
                 rng = np.random.default_rng([self.cfg.seed, 5, number])
                 advance = partial(bar.update, task)
-                return partial(collect, workers, self.views, self.protocol.samples, self.rows, number, labels, rng,
+                version = max(0, number - 1) if algo.overlap else number
+                return partial(collect, workers, self.views, self.protocol.samples, self.rows, number,
+                               round_beta(algo, number), version, labels, rng,
                                lambda count: advance(completed=count))  # fmt: skip
 
             while done.round < algo.rounds:
@@ -270,9 +277,13 @@ class Run:
             done.fit, done.log_rows = state, log.rows
             self.save()
 
+        if number == 0:  # later on it would change what the weights mean
+            twists = [self.buffer.frames(i)["expert", "twist"] for i in range(len(self.buffer.episodes))]
+            for member in members(self.learner):
+                member.network.normalize(torch.cat(twists))
         nets = networks(self.learner).to(self.protocol.device)
         objective = imitation_objective(self.learner, self.algo, options.seed)
-        labels = Labels(self.buffer, self.algo.learner.chunk)
+        labels = Labels(self.buffer, self.algo.learner.chunk, drawn_rows(self.buffer, self.algo.sampling, number))
         # One thread: several would wait for each other on cores that also collect, and slow both down many times.
         with steady_floats() if self.algo.overlap else nullcontext():
             fit(nets, labels, options, objective=objective, device=self.protocol.device, on_checkpoint=checkpoint,
@@ -367,8 +378,10 @@ def round_beta(algo: ImitationOptions, number: int) -> float:
 def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> RowsOptions:
     """What a row of the buffer holds."""
     state = gate.initial_state(torch.Size([1])).keys(include_nested=True, leaves_only=True)
-    further: list[Key] = list(state) if algo.gate.budget is not None else []
-    return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], tuple(further), algo.oracle)
+    compared = [key for key in gate.in_keys if key[0] == "learner"]
+    draws: list[Key] = ["seed"] if algo.learner.draws and algo.gate.budget is not None else []
+    further = tuple(dict.fromkeys([*state, *compared, *draws]))
+    return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], further, algo.oracle)
 
 
 def fit_options(algo: ImitationOptions, labels: int, seed: int, number: int) -> FitOptions:

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.objectives import BCLoss
 
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
+from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.flow_policy import FlowPolicy
@@ -24,42 +23,75 @@ from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, Interactive
 from fb3d_rl.policies.learner import INPUTS, Learner, rotated
 from fb3d_rl.policies.options import LearnerOptions
 from fb3d_rl.seeds import derived
-from fb3d_rl.training.draws import generator
+from fb3d_rl.training.draws import generator, global_draws
 from fb3d_rl.training.objective import Objective
 
 if TYPE_CHECKING:
-    from fb3d_rl.algos.options import ImitationOptions
+    from fb3d_rl.algos.options import ImitationOptions, SamplingOptions
 
-# TorchRL 0.14.1 warns so about its own BCLoss, in which two annotations are missing.
-warnings.filterwarnings("ignore", message="The name target_actor_network_params wasn't part")
-TURN = 4
-"""Purpose of random draws; see :func:`fb3d_rl.training.draws.generator`."""
+TURN, NOISE = 4, 9
+"""Purposes of random draws; see :func:`fb3d_rl.training.draws.generator`."""
 
 
 class Labels:
     """The buffer's rows for the loss: with "twist", the expert's twists of the next ``chunk`` steps, and "is_pad".
 
     Where the episode ends earlier, the twists are padded; the loss leaves the padding out.
+
+    Args:
+        buffer: the rows.
+        chunk: see above.
+        drawn: numbers of the rows to learn from, as :func:`drawn_rows` gives them; None for each of them once.
     """
 
-    def __init__(self, buffer: DemonstrationBuffer, chunk: int) -> None:
-        self._buffer, self._chunk = buffer, chunk
+    def __init__(self, buffer: DemonstrationBuffer, chunk: int, drawn: Tensor | None = None) -> None:
+        self._buffer, self._chunk, self._drawn = buffer, chunk, drawn
 
     def __len__(self) -> int:
-        return len(self._buffer)
+        return len(self._buffer) if self._drawn is None else len(self._drawn)
 
     def __getitem__(self, index: Index) -> TensorDictBase:
         return pick(index, len(self), self._take)
 
     def _take(self, index: Tensor) -> TensorDictBase:
+        index = index if self._drawn is None else self._drawn[index]
         rows = self._buffer[index]
         steps = torch.arange(self._chunk)
-        ahead = (index[:, None] + steps).clamp(max=len(self) - 1)
+        ahead = (index[:, None] + steps).clamp(max=len(self._buffer) - 1)
         later = rows[:, None] if self._chunk == 1 else self._buffer[ahead.flatten()].view(len(index), self._chunk)
         rows["twist"] = later["expert", "twist"]
         follows = later["elapsed_steps"].squeeze(-1) == rows["elapsed_steps"] + steps
         rows["is_pad"] = ~(follows & (later["episode"].squeeze(-1) == rows["episode"]))
         return rows
+
+
+def drawn_rows(buffer: DemonstrationBuffer, options: SamplingOptions, number: int) -> Tensor | None:
+    """Numbers of the rows that round ``number`` learns from, those of larger weight more often; None for all rows.
+
+    There are as many numbers as rows that count; how often each of them comes is its share, rounded up or down.
+
+    Raises:
+        UserError: no row counts.
+    """
+    if options.rows == "all" and options.expert == options.learner:
+        return None
+    weights = []
+    for episode, info in enumerate(buffer.episodes):
+        counts = {
+            "all": True,
+            "recent": info.round > number - options.rounds,
+            "successes": info.success,
+        }[options.rows]
+        acts = buffer.frames(episode)["expert", "acts"].flatten()
+        weights.append(torch.where(acts, options.expert, options.learner).double() * counts)
+    weight = torch.cat(weights)
+    total, count = weight.sum(), int((weight > 0).sum())
+    if not count:
+        raise UserError(
+            f"algo.sampling.rows={options.rows} leaves no label to learn from in round {number + 1}; choose another, "
+            "or give algo.sampling.expert and algo.sampling.learner more than 0"
+        )
+    return torch.searchsorted(weight.cumsum(0) / total, (torch.arange(count) + 0.5) / count)
 
 
 def new_learner(
@@ -123,31 +155,31 @@ def learner_options(algo: ImitationOptions) -> LearnerOptions:
 
 
 def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, seed: int) -> Objective:
-    """TorchRL's BCLoss of every member on inputs that are rotated and mirrored at random.
+    """The loss of every member's head on inputs that are rotated and mirrored at random.
 
     A member that predicts its distance from the expert is also fitted to that: the norm of the difference between the
     normalised twists of the first step.
     """
-    losses = []
-    for member in members(learner):
-        loss = BCLoss(member.actor(), loss_function=None if algo.learner.head == "gaussian" else algo.loss)
-        loss.set_keys(action="twist", pad_mask=None if algo.learner.head == "gaussian" else "is_pad")
-        losses.append(loss)
+    losses = [member.network.loss(algo.loss, algo.kl_weight) for member in members(learner)]
     largest = math.radians(algo.turn)
 
     def objective(rows: TensorDictBase, step: int) -> Tensor:
         values = []
         for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
-            draws = torch.rand(2, len(rows), generator=generator(numbered_seed(seed, "member", k), TURN, step)).to(
-                rows.device
-            )
+            own = numbered_seed(seed, "member", k)
+            draws = torch.rand(2, len(rows), generator=generator(own, TURN, step)).to(rows.device)
             mirrored = (draws[1] < 0.5) & algo.mirror
             inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * largest, mirrored)
-            inputs["twist"], inputs["is_pad"] = twist, rows["is_pad"]
-            values.append(loss(inputs)["loss_bc"])
+            encoded, _ = member.network(*(inputs[key] for key in INPUTS))
+            twist = twist.masked_fill(rows["is_pad"][..., None], 0.0)
+            batch = {"encoded": encoded, "twist": twist, "is_pad": rows["is_pad"]}
+            with global_draws(generator(own, NOISE, step), twist.device):
+                values.append(loss(TensorDict(batch, batch_size=rows.batch_size)))
             if member.options.discrepancy:
-                mean, *_, distance = member.network(*(inputs[key] for key in INPUTS))
-                true = (mean[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
+                noise = torch.randn(len(rows), member.network.noise, generator=generator(own, NOISE, step))
+                plan, distance = member.planned(inputs, noise.to(twist.device))
+                assert distance is not None
+                true = (plan[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
                 values.append(nn.functional.smooth_l1_loss(distance, true, beta=0.1))
         return torch.stack(values).mean()
 

@@ -65,6 +65,18 @@ class BetaOptions:
 
 
 @dataclass(frozen=True)
+class SamplingOptions:
+    """Which labels a round learns from, and how often."""
+
+    rows: Literal["all", "recent", "successes"] = option(
+        "all", "all labels, those of the last rounds, or those of episodes that ended with success"
+    )
+    rounds: int = option(2, "the last rounds of rows=recent, with the present one", within="[1, inf)")
+    expert: float = option(1.0, "weight of labels of steps in which the expert acted", within="[0, inf)")
+    learner: float = option(1.0, "weight of labels of steps in which the learner acted", within="[0, inf)")
+
+
+@dataclass(frozen=True)
 class ImitationOptions(OptimizerOptions, AlgoOptions):
     """Behaviour cloning and DAgger."""
 
@@ -76,6 +88,7 @@ class ImitationOptions(OptimizerOptions, AlgoOptions):
     )
     beta: BetaOptions = group(BetaOptions)
     gate: GateOptions = group(GateOptions)
+    sampling: SamplingOptions = group(SamplingOptions)
     oracle: bool = option(False, "the expert drives to the contact point; the learner acts while suction holds a part")
     members: int = option(1, "number of learners; several are an ensemble", within="[1, inf)")
     learner: LearnerOptions = group(LearnerOptions)
@@ -92,8 +105,7 @@ class ImitationOptions(OptimizerOptions, AlgoOptions):
     validate_trials: int = option(
         0, "trials with validation objects after each round, for the learning curve", within="[0, inf)"
     )
-    loss: Literal["l1", "l2", "smooth_l1"] = option(
-        "l1", "loss of a deterministic head; a Gaussian head has its likelihood"
-    )
+    loss: Literal["l1", "l2", "smooth_l1"] = option("l1", "loss of a deterministic head; the others have their own")
+    kl_weight: float = option(10.0, "of head=act: weight of its latent's divergence from a normal", within="[0, inf)")
     turn: float = option(15.0, "inputs are rotated about z by a random angle of at most this", "degrees", "[0, inf)")
     mirror: bool = option(True, "mirror inputs with probability 1/2")

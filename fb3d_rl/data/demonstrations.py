@@ -322,6 +322,22 @@ def _require_numbers(frames: TensorDictBase) -> None:
             raise UserError(f"the data do not fit the task: observation {key} holds NaN or infinity; leave it out")
 
 
+def recorded(frames: TensorDictBase, info: EpisodeInfo, beta: float, version: int) -> TensorDictBase:
+    """Frames [T] with the group "record", which says how they came about; rows that have it keep theirs.
+
+    Args:
+        frames: of one episode.
+        info: its facts, of which round and success go to each row.
+        beta: probability with which the expert acted by DAgger's schedule.
+        version: number of fits that the weights of the learner had behind them; -1 if there was no learner.
+    """
+    if "record" not in frames.keys():
+        values = {"beta": beta, "policy_version": version, "round": info.round, "success": info.success}
+        for key, value in values.items():
+            frames["record", key] = torch.full((len(frames), 1), value)
+    return frames
+
+
 def foreign_episode(category: str, success: bool, steps: int, seed: int = 0) -> EpisodeInfo:
     """The facts of an episode of foreign data, whose object and start are unknown."""
     return EpisodeInfo("unknown", category, -1, (), View(0.0, 0.0), seed, 0, success, math.nan, steps)

@@ -12,7 +12,8 @@ bit. Not kept: the buffer's capacity, and keys with a dot in their name. Statist
 needs to merge data sets only, are left out.
 
 Data sets of other projects can be read if their features have the names and shapes of the data contract. Their episodes
-count as successful: LeRobot's format has no field for it, and failed demonstrations are rarely published.
+count as successful, unless a column "record.success" says otherwise: LeRobot's format has no field for it, and failed
+demonstrations are rarely published.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,10 +111,7 @@ def read(folder: Path, out: Path | str) -> DemonstrationBuffer:
         with new_buffer(out, max(info["total_frames"], 1), about) as buffer:
             for k, frames in enumerate(_read_rows(folder, info["features"])):
                 frames = demonstrated(frames)
-                facts = (
-                    EpisodeInfo.from_dict(own["episodes"][k]) if own else foreign_episode("unknown", True, len(frames))
-                )
-                buffer.extend(frames, facts)
+                buffer.extend(frames, EpisodeInfo.from_dict(own["episodes"][k]) if own else _stranger(frames))
             if len(buffer) != info["total_frames"] or not len(buffer):
                 raise ValueError(
                     f"{len(buffer)} of its {info['total_frames']} frames are there; was it written to the end?"
@@ -121,6 +119,15 @@ def read(folder: Path, out: Path | str) -> DemonstrationBuffer:
     except (OSError, ValueError, KeyError, TypeError, IndexError, arrow.ArrowException) as error:
         raise UserError(f"{folder} cannot be read as a data set of LeRobot ({error})") from error
     return buffer
+
+
+def _stranger(frames: TensorDictBase) -> EpisodeInfo:
+    """Facts about an episode [T] that has no entry in :data:`ABOUT`; its rows may say of success and round."""
+    info, record = foreign_episode("unknown", True, len(frames)), frames.get("record", None)
+    if record is None:
+        return info
+    last = record[-1]
+    return replace(info, success=bool(last.get("success", True)), round=int(last.get("round", 0)))
 
 
 class _Stats:

@@ -140,8 +140,12 @@ def _sum(rows: Tensor, present: Tensor) -> Tensor:
 
 
 def initialize(net: nn.Module, generator: torch.Generator) -> None:
-    """Draw every linear map anew from the distribution that ``nn.Linear`` uses, with a generator handed in."""
+    """Draw all weights anew from the distributions that PyTorch's modules use, with a generator handed in."""
     for module in net.modules():
+        if isinstance(module, nn.Embedding):
+            nn.init.normal_(module.weight, generator=generator)
+        if isinstance(module, nn.MultiheadAttention):
+            nn.init.xavier_uniform_(module.in_proj_weight, generator=generator)
         if isinstance(module, nn.Linear):
             nn.init.kaiming_uniform_(module.weight, a=math.sqrt(5), generator=generator)
             if module.bias is not None:

@@ -64,6 +64,31 @@ class PointNet2Encoder(nn.Module):
         return self.out(torch.cat([self.sa3(middle, level2), context], dim=-1))
 
 
+class DP3Encoder(nn.Module):
+    """The encoder of 3D Diffusion Policy (Ze et al. 2024), which people who train on ManiSkill or with LeRobot expect.
+
+    An MLP with layer norm on every point, the maximum over the points, a projection with layer norm; proprioception has
+    an MLP of its own, and the last layer gets both.
+
+    Args and Shapes: as of :class:`PointNet`.
+    """
+
+    def __init__(self, inputs: int, context: int, outputs: int, width: int = 64) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for a, b in ((3 + inputs, width), (width, 2 * width), (2 * width, 4 * width)):
+            layers += [nn.Linear(a, b), nn.LayerNorm(b), nn.ReLU()]
+        self.local = nn.Sequential(*layers)
+        self.project = nn.Sequential(nn.Linear(4 * width, width), nn.LayerNorm(width))
+        self.felt = mlp(context, width, width)
+        self.out = mlp(2 * width, 4 * width, 4 * width, outputs)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
+        """See :class:`PointNet`."""
+        local = self.local(torch.cat([points, features], dim=-1)).masked_fill(~valid[..., None], 0.0)
+        return self.out(torch.cat([self.project(local.amax(1)), self.felt(context)], dim=-1))
+
+
 class AttentionPointNet(nn.Module):
     """PointNet with attention: each head attends to one place in the cloud.
 
@@ -116,9 +141,10 @@ class AttentionPointNet(nn.Module):
         return nn.functional.linear(pad(own), pad(self.first.weight), self.first.bias)
 
 
-ENCODERS: dict[str, type[PointNet | PointNet2Encoder | AttentionPointNet]] = {
+ENCODERS: dict[str, type[PointNet | PointNet2Encoder | AttentionPointNet | DP3Encoder]] = {
     "pointnet": PointNet,
     "pointnet2": PointNet2Encoder,
     "attention": AttentionPointNet,
+    "dp3": DP3Encoder,
 }
 """The encoders by name."""

@@ -14,6 +14,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from fb3d_rl.options import came_later
+
 LENGTH = 16
 """Hexadecimal digits of a digest."""
 
@@ -69,7 +71,11 @@ def _described(value: Any, hidden: list[nn.Module]) -> Any:
         _take_tensor(digest, value)
         return digest.hexdigest()
     if is_dataclass(value) and not isinstance(value, type):
-        held = {item.name: _described(getattr(value, item.name), hidden) for item in fields(value)}
+        held = {
+            item.name: _described(getattr(value, item.name), hidden)
+            for item in fields(value)
+            if not came_later(item, getattr(value, item.name))
+        }
         return [type(value).__qualname__, held]
     if isinstance(value, Mapping):
         return [[_described(key, hidden), _described(item, hidden)] for key, item in value.items()]

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import (
-    InteractionType,
-    ProbabilisticTensorDictModule,
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
 from torch import Tensor, nn
-from torchrl.modules import IndependentNormal
 
 from fb3d_rl.contract import Key
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
+from fb3d_rl.models.heads import Loss, make_head
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
+from fb3d_rl.policies.interaction import normal, uniform
 from fb3d_rl.policies.options import LearnerOptions
+from fb3d_rl.policies.plans import executed, plan_state
 from fb3d_rl.policies.policy import Policy
 
 TWIST = 6
@@ -62,35 +55,68 @@ FLOW_KEYS: dict[str, Key | None] = {
 """Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
 
 
+LEAST_SIZE = 0.02
+"""Labels are divided by no less than this share of the gripper's limits."""
+
+NOISE = 8
+"""Purpose of random draws; see :func:`fb3d_rl.policies.interaction.uniform`."""
+
+
 class TwistNetwork(nn.Module):
     """An encoder and its heads.
 
     Args:
         options: the network.
 
-    Shapes: the entries of :meth:`Learner.network_inputs` -> twist [B, chunk, 6], or of the Gaussian head mean and
-    standard deviation; then, if asked for, the discrepancy [B, 1].
+    Shapes: the entries of :meth:`Learner.network_inputs` -> what the head reads [B, ...], and, if asked for, the
+    discrepancy [B, 1].
     """
+
+    size: Tensor
 
     def __init__(self, options: LearnerOptions) -> None:
         super().__init__()
         self.options = options
-        planned = TWIST * options.chunk
-        outputs = planned * (2 if options.head == "gaussian" else 1) + int(options.discrepancy)
+        self._head = make_head(
+            options.head, options.chunk, TWIST, options.width, options.components, options.calls
+        )  # fmt: skip
+        outputs = self._head.inputs + int(options.discrepancy)
         inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
         self.encoder = ENCODERS[options.encoder](inputs, HAND_FEATURES * (1 + options.history), outputs, options.width)
+        if self._head.network is not None:
+            self.head = self._head.network
+        if options.normalized:
+            self.register_buffer("size", torch.ones(TWIST))
 
-    def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> Any:
-        """See the class; a single output comes by itself."""
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> tuple[Tensor, Tensor | None]:
+        """See the class; None where no discrepancy is asked for."""
         raw = self.encoder(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
-        planned = TWIST * self.options.chunk
-        parts = [raw[:, :planned].unflatten(-1, (-1, TWIST))]
-        if self.options.head == "gaussian":
-            # A lower bound keeps the likelihood of labels that repeat exactly finite.
-            parts.append(nn.functional.softplus(raw[:, planned : 2 * planned]).unflatten(-1, (-1, TWIST)) + 0.02)
-        if self.options.discrepancy:
-            parts.append(nn.functional.softplus(raw[:, -1:]))
-        return tuple(parts) if len(parts) > 1 else parts[0]
+        distance = nn.functional.softplus(raw[:, -1:]) if self.options.discrepancy else None
+        return raw[:, : self._head.inputs], distance
+
+    @property
+    def noise(self) -> int:
+        """Standard normal numbers that a plan is made from; 0: none."""
+        return self._head.noise
+
+    def plan(self, encoded: Tensor, noise: Tensor | None = None) -> Tensor:
+        """The plan [B, chunk, 6], shares of the gripper's limits; see :meth:`fb3d_rl.models.heads.Head.plan`."""
+        plan = self._head.plan(encoded, noise)
+        return plan * self.size if self.options.normalized else plan
+
+    def loss(self, kind: str, kl_weight: float) -> Loss:
+        """The loss of :meth:`fb3d_rl.models.heads.Head.loss`, for plans as :meth:`plan` gives them."""
+        loss = self._head.loss(kind, kl_weight)
+        if not self.options.normalized:
+            return loss
+        return lambda batch: loss(batch.copy().set("twist", batch["twist"] / self.size))
+
+    @torch.no_grad()
+    def normalize(self, twists: Tensor) -> None:
+        """Measure labels [R, 6]: velocities and turnings have one size each, so that it turns with the scene."""
+        if self.options.normalized:
+            size = twists.unflatten(-1, (2, 3)).square().mean((0, 2)).sqrt().clamp_min(LEAST_SIZE)
+            self.size.copy_(size.repeat_interleave(3))
 
 
 class Learner(Policy):
@@ -130,7 +156,8 @@ class Learner(Policy):
         self.flow_network = None if flow_net is None else flow_net.requires_grad_(False).eval()
         self._predict = None if flow_net is None else artflownet_module(flow_net)
         given = [flow] if flow and flow_net is None else []
-        self.in_keys = [*OBSERVED, *given, *(("learner", key) for key in self._state())]
+        episode: list[Key] = ["seed", "elapsed_steps"] if self.network.noise else []  # what noise depends on
+        self.in_keys = [*OBSERVED, *given, *episode, *(("learner", key) for key in self._state())]
         self.out_keys = ["action", *(("next", "learner", key) for key in self._state())]
         if options.discrepancy:
             self.out_keys.append(("learner", "discrepancy"))
@@ -141,9 +168,7 @@ class Learner(Policy):
         state: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
         if self.options.history:
             state["felt"] = ((self.options.history, HAND_FEATURES), torch.float32)
-        if self.options.execute > 1:
-            state["plan"] = ((self.options.execute - 1, TWIST), torch.float32)
-            state["planned"] = ((1,), torch.int64)
+        state.update(plan_state(self.options, TWIST))
         return state
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
@@ -178,21 +203,10 @@ class Learner(Policy):
             self.flow_network.eval()
         return self
 
-    def actor(self) -> TensorDictModuleBase:
-        """What TorchRL's BCLoss trains: network inputs -> "twist" [B, chunk, 6] (and "discrepancy" [B, 1])."""
-        outputs: list[Key] = ["loc", "scale"] if self.options.head == "gaussian" else ["twist"]
-        if self.options.discrepancy:
-            outputs.append("discrepancy")
-        module = TensorDictModule(self.network, in_keys=list(INPUTS), out_keys=outputs)
-        if self.options.head == "deterministic":
-            return module
-        draw = ProbabilisticTensorDictModule(
-            in_keys=["loc", "scale"],
-            out_keys=["twist"],
-            distribution_class=_ChunkNormal,
-            default_interaction_type=InteractionType.DETERMINISTIC,
-        )
-        return ProbabilisticTensorDictSequential(module, draw)
+    def planned(self, inputs: TensorDictBase, noise: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Plan [B, chunk, 6] and discrepancy [B, 1] of :meth:`network_inputs`, from ``noise`` if the head needs it."""
+        encoded, distance = self.network(*(inputs[key] for key in INPUTS))
+        return self.network.plan(encoded, noise), distance
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -200,31 +214,18 @@ class Learner(Policy):
         if self._predict is not None:
             self._predict(tensordict)
         inputs, obs = self.network_inputs(tensordict), tensordict["observation"]
-        outputs = self.network(*(inputs[key] for key in INPUTS))
-        plan_now = outputs[0] if isinstance(outputs, tuple) else outputs
-        twist, execute = plan_now[:, 0], self.options.execute
-        if execute > 1:
-            planned, plan = tensordict["learner", "planned"], tensordict["learner", "plan"]
-            goes_on = (planned > 0)[..., None]
-            whole = torch.cat([plan, torch.zeros_like(plan[:, :1])], dim=1)
-            whole = torch.where(goes_on, whole, plan_now[:, :execute])
-            twist = whole[:, 0]
-            tensordict["next", "learner", "plan"] = whole[:, 1:]
-            tensordict["next", "learner", "planned"] = torch.where(planned > 0, planned - 1, execute - 1)
+        draws = uniform(tensordict, NOISE, count=self.network.noise) if self.network.noise else None
+        plan, distance = self.planned(inputs, None if draws is None else normal(draws).to(obs["points"]))
+        twist, state = executed(plan, tensordict.get("learner", None), self.options)
+        for key, value in state.items():
+            tensordict["next", "learner", key] = value
         if self.options.history:
             tensordict["next", "learner", "felt"] = inputs["felt"][:, :-1]
-        if self.options.discrepancy:
-            tensordict["learner", "discrepancy"] = outputs[-1]
+        if distance is not None:
+            tensordict["learner", "discrepancy"] = distance
         velocity, angular = twist[:, :3] * self.limits.linear, twist[:, 3:] * self.limits.angular
         tensordict["action"] = joint_velocities(obs, hand_axis(obs["tool_pose"]), velocity, angular, self.limits)
         return tensordict
-
-
-class _ChunkNormal(IndependentNormal):
-    """Normal over the entries [chunk, 6] of a plan."""
-
-    def __init__(self, loc: Tensor, scale: Tensor) -> None:
-        super().__init__(loc, scale, event_dim=2)
 
 
 def hand_features(obs: TensorDictBase, limits: VelocityLimits) -> Tensor:

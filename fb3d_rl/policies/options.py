@@ -277,9 +277,11 @@ class LearnerOptions:
         discrepancy: whether it also predicts its distance from the expert, which some gates ask for.
     """
 
-    encoder: Literal["attention", "pointnet", "pointnet2"] = option("attention", "of the cloud")
-    head: Literal["deterministic", "gaussian"] = option(
-        "deterministic", "gaussian has a mean and a standard deviation; the mean is executed"
+    encoder: Literal["attention", "pointnet", "pointnet2", "dp3"] = option(
+        "attention", "of the cloud; dp3 is that of 3D Diffusion Policy"
+    )
+    head: Literal["deterministic", "gaussian", "mixture", "act", "diffusion", "flow_matching"] = option(
+        "deterministic", "how a plan is made, see fb3d_rl.models.heads"
     )
     flow: Literal["none", "ground_truth", "artflownet"] = option(
         "none", "the flow as a further input of each point; artflownet is its prediction"
@@ -293,7 +295,34 @@ class LearnerOptions:
     )
     chunk: int = option(1, "how far it plans ahead ...", "control steps", "[1, inf)")
     execute: int = option(1, "... of which this many are executed before the next plan", "control steps", "[1, inf)")
+    ensemble: float | None = option(
+        None,
+        "temporal ensembling: it plans in every step, and executes the mean of all plans for this step, the i-th "
+        "oldest with weight exp(-ensemble i); ACT's is 0.01; null: it executes the plan as it is",
+        within="[0, inf)",
+        later=True,
+    )
+    components: int = option(5, "normals of head=mixture", within="[1, inf)", later=True)
+    calls: int = option(
+        10, "calls of the network for a plan of head=diffusion and head=flow_matching", within="[1, inf)", later=True
+    )
+    normalize: bool | None = option(
+        None,
+        "whether velocities and angular velocities of the labels are divided by their root mean square in the first "
+        "round; null: for the heads act, diffusion and flow_matching, which compare them with unit noise",
+        later=True,
+    )
     discrepancy: bool = False
+
+    @property
+    def draws(self) -> bool:
+        """Whether a plan is made from noise, which the trial's seed decides."""
+        return self.head in ("diffusion", "flow_matching")
+
+    @property
+    def normalized(self) -> bool:
+        """Whether labels are divided by their size."""
+        return self.head == "act" or self.draws if self.normalize is None else self.normalize
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -304,3 +333,7 @@ class LearnerOptions:
         check(self)
         if self.execute > self.chunk:
             raise UserError(f"execute={self.execute} is more than the chunk={self.chunk} that is planned")
+        if self.ensemble is not None and (self.execute > 1 or self.chunk == 1):
+            raise UserError(
+                f"ensemble={self.ensemble} averages plans that overlap; give chunk=2 or more, and leave execute=1"
+            )

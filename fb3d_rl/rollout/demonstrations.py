@@ -230,11 +230,18 @@ def replay(buffer: DemonstrationBuffer, episode: int, obj: ArticulatedObject) ->
         The film, and whether the observed points and the tip's positions equal the recorded ones bit for bit.
 
     Raises:
-        UserError: the trial or the task's constants are unknown.
+        UserError: the trial or the task's constants are unknown, or steps are missing.
     """
     info, frames = buffer.episodes[episode], buffer.frames(episode)
+    if not torch.equal(frames["elapsed_steps"].flatten().long(), torch.arange(len(frames))):
+        raise UserError(
+            f"episode {episode} cannot be run again: only steps in which suction held a part were kept of it"
+        )
     options = replace(recorded_options(buffer), horizon=info.rows)
     film = record(f"episode {episode}", Replay(frames["action"]), obj, trial_of(info), options)
+    acts = frames["expert", "acts"].flatten()
+    if not bool(acts.all()):
+        film = replace(film, expert_acts=acts.numpy())
     seen = torch.from_numpy(film.points[:-1]), torch.from_numpy(film.tips[:-1])
     kept = frames["observation", "points"], frames["observation", "tool_pose"][:, :3]
     return film, all(torch.equal(a, b) for a, b in zip(seen, kept, strict=True))

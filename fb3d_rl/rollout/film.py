@@ -42,6 +42,7 @@ class Film:
         distance: normalized distance [T + 1].
         success: whether the part was open at the end.
         rate: control steps per second.
+        expert_acts: [T], whether the expert acted in a step, of an episode that it shared with a learner; else None.
     """
 
     policy: str
@@ -58,6 +59,7 @@ class Film:
     distance: NDArray[np.float32]
     success: bool
     rate: int
+    expert_acts: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.poses)

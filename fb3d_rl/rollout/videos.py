@@ -23,6 +23,9 @@ from fb3d_rl.rollout.rows import TrialRow, film_name, own_policy
 from fb3d_rl.rollout.shot import Shot, moments
 from fb3d_rl.rollout.trials import Scheduled
 
+EXPERT, LEARNER = "#3b4252", "#e8a33d"
+"""Colours of the bar that says who acted."""
+
 SIZE = (480, 360)
 """Width and height (pixels) of a video's pictures."""
 
@@ -44,6 +47,17 @@ def _state(film: Film, t: int) -> str:
     return f"step {t} · {100 * film.opened[t]:.0f} % opened"
 
 
+def _draw_actors(draw: ImageDraw.ImageDraw, film: Film, box: tuple[int, int, int, int], until: int) -> None:
+    """A bar over the episode, left to right, up to step ``until``: who acted when."""
+    if film.expert_acts is None:
+        return
+    left, top, right, bottom = box
+    draw.rectangle(box, TRACK)
+    for step, expert in enumerate(film.expert_acts[:until]):
+        ends = [left + round((right - left) * place / len(film.expert_acts)) for place in (step, step + 1)]
+        draw.rectangle((ends[0], top, ends[1], bottom), EXPERT if expert else LEARNER)
+
+
 def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -> Iterator[NDArray[np.uint8]]:
     """The film's pictures of that ``size`` with a caption below each: one for each moment, [H + CAPTION, W, 3]."""
     shot = Shot(film, *size, view)
@@ -57,6 +71,7 @@ def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -
         draw.text((10, 8), _title(film), FAINT, small)
         draw.rectangle((0, height, width, height + 3), TRACK)
         draw.rectangle((0, height, round(width * float(film.opened[t])), height + 3), hex_color(TARGET))
+        _draw_actors(draw, film, (0, 0, width, 5), t)
         draw.text((10, middle), _state(film, t), INK, usual, anchor="lm")
         word = "holding" if film.attached[t] else "not holding"
         draw.text((width - 10, middle), word, INK, usual, anchor="rm")
@@ -95,6 +110,13 @@ def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View
         image.paste(picture, (left, top))
         draw.text((left, below), name, INK, bold)
         draw.text((left, below + round(1.1 * line)), _state(film, t), FAINT, usual)
+    if film.expert_acts is not None:
+        _draw_actors(draw, film, (0, image.height - 8, width, image.height), len(film) - 1)
+        share = 100 * film.expert_acts.mean()
+        said = (
+            f"below: who acted, from the first step to the last: the expert (dark, {share:.0f} %), the learner (light)"
+        )
+        draw.text((width, 0), said, FAINT, usual, anchor="ra")
     with replacing(path) as part:
         image.save(part)
 

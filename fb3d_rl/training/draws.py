@@ -6,6 +6,8 @@ All of it depends on the seed and the number of the step alone.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 
 import torch
@@ -21,6 +23,16 @@ def generator(seed: int, purpose: int, number: int) -> torch.Generator:
     """
     mixed = (seed * 0x9E3779B97F4A7C15 + purpose * 0xBF58476D1CE4E5B9 + number * 0x94D049BB133111EB) % 2**63
     return torch.Generator().manual_seed(mixed)
+
+
+@contextmanager
+def global_draws(source: torch.Generator, device: torch.device) -> Iterator[None]:
+    """Let what draws from torch's global generators, as TorchRL's losses do, draw from ``source`` for a while."""
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.set_rng_state(source.get_state())
+        if device.type == "cuda":
+            torch.cuda.manual_seed(source.initial_seed())
+        yield
 
 
 @lru_cache(maxsize=2)  # a batch is of one pass, or of the end of one and the start of the next

@@ -19,13 +19,17 @@ from tensordict import TensorDict
 
 from fb3d_rl.algos import collection
 from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, share
+from fb3d_rl.algos.learners import Labels, drawn_rows
+from fb3d_rl.algos.options import SamplingOptions
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.run import run_training as run
-from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.camera.views import View
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import twist_of
 from fb3d_rl.rollout.collectors import Episode
+from fb3d_rl.rollout.demonstrations import recorded_object, replay
 from fb3d_rl.rollout.rows import read_trials
 from fb3d_rl.training.checkpoint import load_checkpoint
 from fb3d_rl.training.run_log import read_rows
@@ -119,14 +123,69 @@ def test_the_experts_share_is_of_the_labelled_steps(monkeypatch: pytest.MonkeyPa
     ]  # fmt: skip
     trials = [SimpleNamespace(object="a"), SimpleNamespace(object="a")]
     monkeypatch.setattr(collection, "draw_trials", lambda *_: trials)
-    monkeypatch.setattr(collection, "episode_info", lambda *_: SimpleNamespace(success=True))
+    monkeypatch.setattr(collection, "episode_info", lambda *_: SimpleNamespace(success=True, round=0))
     workers = SimpleNamespace(run=lambda *_: [Episode(i, frames) for i, frames in enumerate(episodes)])
     rows = SimpleNamespace(keys=list, of=lambda frames: frames[frames["labelled"]])
     views = [SimpleNamespace(obj=SimpleNamespace(id="a", category="Oven"))]
-    found = collection.collect(*cast("Any", (workers, views, None, rows, 0, 7, np.random.default_rng(0))))
+    found = collection.collect(*cast("Any", (workers, views, None, rows, 0, 0.4, 3, 7, np.random.default_rng(0))))
     kept = torch.cat([frames["expert", "acts"] for frames, _ in found.episodes]).flatten()
     assert kept.tolist() == [0, 0, 1, 0, 0, 0, 1]
+    for frames, _ in found.episodes:
+        assert all(value.flatten().unique().tolist() == [pytest.approx(wanted)] for value, wanted in (
+            (frames["record", "beta"], 0.4), (frames["record", "policy_version"], 3), (frames["record", "round"], 0),
+            (frames["record", "success"], True)))  # fmt: skip
     assert found.numbers["collect/expert_share"] == kept.double().mean() == 2 / 7
+
+
+def test_a_row_says_how_it_came_about(first: Path) -> None:
+    buffer = DemonstrationBuffer.open(first / BUFFER)
+    for i, info in enumerate(buffer.episodes):
+        record = buffer.frames(i)["record"]
+        expected = {
+            "beta": 1.0 - info.round,
+            "policy_version": info.round,
+            "round": info.round,
+            "success": info.success,
+        }
+        assert {key: value.unique().tolist() for key, value in record.items()} == {
+            key: [value] for key, value in expected.items()
+        }
+
+
+def test_a_runs_labels_can_be_listed_and_run_again(first: Path) -> None:
+    buffer = DemonstrationBuffer.open(first / BUFFER)
+    of_learner = [info.round for info in buffer.episodes].index(1)
+    film, exact = replay(buffer, of_learner, recorded_object(buffer, of_learner))
+    assert exact and film.expert_acts is not None and not film.expert_acts.any()
+    assert len(film.expert_acts) == len(film) - 1
+    assert replay(buffer, 0, recorded_object(buffer, 0))[0].expert_acts is None, "there was no learner yet"
+
+
+def test_which_labels_a_round_learns_from(tmp_path: Path) -> None:
+    buffer = DemonstrationBuffer.create(tmp_path / "rows", 40)
+    acts = [[True] * 4, [True, False] * 3, [False] * 5]
+    for number, (made, success) in enumerate(zip(acts, (True, False, True), strict=True)):
+        expert = {"acts": torch.tensor(made)[:, None], "twist": torch.full((len(made), 6), float(number))}
+        frames = TensorDict({"expert": expert, "elapsed_steps": torch.arange(len(made))[:, None]}, [len(made)])
+        buffer.extend(frames, EpisodeInfo("a", "Oven", 0, (), View(0.0, 0.0), round=number, success=success))
+
+    def drawn(number: int = 2, **options: Any) -> list[int] | None:
+        found = drawn_rows(buffer, SamplingOptions(**options), number)
+        return None if found is None else found.tolist()
+
+    assert drawn() is None and drawn(expert=2.0, learner=2.0) is None, "as it was: every row once"
+    assert drawn(rows="recent", rounds=2) == [*range(4, 15)] and drawn(rows="recent", rounds=1) == [*range(10, 15)]
+    assert drawn(rows="successes") == [0, 1, 2, 3, *range(10, 15)]
+    assert drawn(rows="recent", learner=0.0) == [4, 6, 8]
+    counts = torch.tensor(drawn(expert=3.0)).bincount(minlength=15)
+    share = counts.double() / (15 * torch.tensor([3.0 if a else 1.0 for row in acts for a in row]) / (3 * 7 + 8))
+    assert counts.sum() == 15 and counts[:4].sum() in (6, 7) and share.mean() == pytest.approx(1.0, abs=0.2)
+    with pytest.raises(UserError, match=r"sampling\.rows=recent leaves no label to learn from in round 3"):
+        drawn(rows="recent", rounds=1, learner=0.0)
+    labels = Labels(buffer, 2, drawn_rows(buffer, SamplingOptions(rows="successes"), 2))
+    rows = labels[torch.arange(len(labels))]
+    assert len(labels) == 9 and rows["twist"][:, 0, 0].tolist() == [0.0] * 4 + [2.0] * 5
+    assert rows["is_pad"][:, 1].tolist() == [False] * 3 + [True] + [False] * 4 + [True]
 
 
 def test_a_row_holds_the_experts_label_whoever_acted(first: Path) -> None:
@@ -230,8 +289,12 @@ def test_collection_beside_the_fit_repeats(tmp_path: Path, train: Train) -> None
         ["algo=dagger_oracle"],
         ["algo=dagger_flow", "algo.learner.chunk=3", "algo.learner.execute=2"],
         ["algo=bc", "algo.learner.head=gaussian"],
+        ["algo=dagger", "algo.learner.head=mixture", "algo.learner.encoder=dp3"],
+        ["algo=dagger", "algo.learner.head=act", "algo.learner.chunk=4", "algo.learner.ensemble=0.01"],
+        ["algo=bc", "algo.learner.head=diffusion", "algo.learner.chunk=4", "algo.learner.execute=2"],
+        ["algo=safe_dagger", "algo.learner.head=flow_matching", "algo.learner.normalize=false"],
         ["algo=dagger", "algo.beta.schedule=constant", "algo.beta.mixing=step"],
-        ["algo=safe_dagger"],
+        ["algo=safe_dagger", "algo.sampling.rows=recent", "algo.sampling.expert=2"],
         ["algo=ensemble_dagger"],
         ["algo=lazy_dagger"],
         ["algo=thrifty_dagger"],

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from fb3d_rl.camera.views import View
 from fb3d_rl.contract import spec
 from fb3d_rl.data import lerobot, maniskill
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
+from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded
 from fb3d_rl.errors import UserError
 
 POINTS = 6
@@ -37,6 +37,7 @@ def frames(steps: int, seed: int) -> TensorDict:
     td["expert", "action"] = torch.randn(steps, 8, generator=rng).tanh()
     td["expert", "acts"] = torch.rand(steps, 1, generator=rng) > 0.5
     td["elapsed_steps"] = torch.arange(steps, dtype=torch.int32)[:, None]
+    td["learner", "discrepancy"] = torch.rand(steps, 1, generator=rng)
     td["action"][0, 0] = -0.0  # equal to 0, but of other bits
     return td
 
@@ -47,7 +48,7 @@ def buffer(tmp_path: Path) -> DemonstrationBuffer:
     buffer = DemonstrationBuffer.create(tmp_path / "made", 50, {"seed": 3, "env_info": {"env_id": "E"}})
     infos = (INFO, replace(INFO, seed=1), replace(INFO, seed=2, category="Box", success=False, steps=7))
     for k, (steps, info) in enumerate(zip(LENGTHS, infos, strict=True)):
-        buffer.extend(frames(steps, k), info)
+        buffer.extend(recorded(frames(steps, k), info, beta=0.7**k, version=k - 1), info)
     buffer.commit()
     return buffer
 
@@ -121,6 +122,19 @@ def test_lerobots_data_set_says_what_lerobot_asks_for(tmp_path: Path, buffer: De
     assert stats["action"]["count"] == [20]
 
 
+def test_a_data_set_without_the_table_of_episodes_still_says_how_its_rows_came_about(
+    tmp_path: Path, buffer: DemonstrationBuffer
+) -> None:
+    pytest.importorskip("pyarrow")
+    lerobot.write(buffer, tmp_path / "set", 20)
+    features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
+    assert {"action", "expert.action", "expert.acts", "learner.discrepancy", "record.beta"} < set(features)
+    (tmp_path / "set" / lerobot.ABOUT).unlink()
+    again = lerobot.read(tmp_path / "set", tmp_path / "again")
+    assert [(info.success, info.round) for info in again.episodes] == [(True, 1), (True, 1), (False, 1)]
+    assert torch.equal(again.frames(2)["record", "beta"], buffer.frames(2)["record", "beta"])
+
+
 def test_strangers_data_become_the_experts(tmp_path: Path, buffer: DemonstrationBuffer) -> None:
     """As RecordEpisode and LeRobot write it: no labels, and nothing about trials."""
     import h5py
@@ -146,7 +160,8 @@ def test_strangers_data_become_the_experts(tmp_path: Path, buffer: Demonstration
     assert bool((rows["observation", "goal_sense"] == 1).all()), "who says nothing of a goal opens"
     assert torch.equal(rows["expert", "action"], rows["action"]) and bool(rows["expert", "acts"].all())
     assert rows["elapsed_steps"].flatten().tolist() == [t for steps in LENGTHS for t in range(steps)]
-    assert {key: read[0].keys[key] for key in buffer.keys} == buffer.keys, "trained on together with our own"
+    ours = {key: value for key, value in buffer.keys.items() if key[0] not in ("learner", "record")}
+    assert {key: read[0].keys[key] for key in ours} == ours, "trained on together with our own"
     assert [info.success for info in read[0].episodes] == [True, False, False]
 
 
