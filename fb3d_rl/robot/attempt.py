@@ -33,7 +33,7 @@ class AttemptOptions:
     settle: float = option(0.3, "how long the arm stands still while the force's bias is measured", "s", "(0, inf)")
     vacuum_time: float = option(0.5, "how long the vacuum may take", "s", "[0, inf)")
     pull_speed: float = option(0.05, "of the held point, times the normalised flow", "m/s", "(0, 0.2]")
-    turn_gain: float = option(2.0, "angular velocity per angle between the cup's axis and the flow", "1/s", "[0, inf)")
+    turn_gain: float = option(4.0, "angular velocity per angle between the cup's axis and the flow", "1/s", "[0, inf)")
     yield_gain: float = option(
         0.005,
         "velocity per force across the flow, to which a pull yields; 0 is the supplement's",
@@ -108,6 +108,14 @@ class Reason(str, Enum):
     STUCK = "stuck"
     PULL_TIME = "pull time"
     DRIVER = "driver"
+
+
+class Ended(Exception):
+    """Ends an attempt: why, and the same in one sentence."""
+
+    def __init__(self, reason: Reason, sentence: str) -> None:
+        super().__init__(sentence)
+        self.reason, self.sentence = reason, sentence
 
 
 @dataclass(frozen=True, eq=False)

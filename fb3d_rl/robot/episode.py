@@ -2,16 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fb3d_rl.errors import UserError
+from fb3d_rl.perception.suction import choose_place
 from fb3d_rl.robot.arm import Arm
-from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Predictor, Puller
+from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Ended, Predictor, Puller, Reason
+from fb3d_rl.robot.collision import Checker, Obstacles
 from fb3d_rl.robot.driver import Driver
+from fb3d_rl.robot.motion import MOVED, Mover, Pull
+from fb3d_rl.robot.planning import Failure, plan
+from fb3d_rl.robot.reach import MARGIN, RADIUS, before_contact
+from fb3d_rl.robot.seeing import Motion, Seen, look, motion_at, predicted, spread
+from fb3d_rl.robot.sight import ArmSight
+from fb3d_rl.robot.timing import timed
+from fb3d_rl.robot.workspace import cell
+from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
+
+SPACING = 0.01
+"""Between the points of the object's cloud as obstacles, m."""
+
+_PLANNING = {
+    Failure.START_LIMITS: Reason.START_LIMITS,
+    Failure.START: Reason.START_COLLISION,
+    Failure.UNREACHABLE: Reason.UNREACHABLE,
+    Failure.GOAL: Reason.GOAL_COLLISION,
+    Failure.TIMEOUT: Reason.TIMEOUT,
+}
 
 
 def attempt(
@@ -37,7 +62,154 @@ def attempt(
         options: speeds, forces and times.
         seed: of all that is drawn; the same driver answers and seed give the same commands.
         puller: asked in a pull in place of the predictor.
-        opened: asked after each look whether the part is open, which ends the attempt.
+        opened: asked in a pull whether the part is open, which ends the attempt.
         say: gets a line for each stage.
     """
-    raise NotImplementedError
+    return _Run(driver, arm, camera, predictor, options or AttemptOptions(), seed, puller, opened, say).run()
+
+
+class _Run:
+    """An attempt while it runs."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        arm: Arm,
+        camera: Array,
+        predictor: Predictor,
+        options: AttemptOptions,
+        seed: int,
+        puller: Puller | None,
+        opened: Callable[[], bool] | None,
+        say: Callable[[str], None] | None,
+    ) -> None:
+        self.driver, self.arm, self.camera, self.options, self.seed = driver, arm, camera, options, seed
+        self.predictor, self.puller, self.opened = predictor, puller, opened
+        self.say = say or (lambda line: None)
+        self.sight, self.mover = ArmSight(arm), Mover(driver, arm, options)
+        self.rng = np.random.default_rng(derived(seed, "attempt"))
+        self.result: dict[str, Any] = {}
+        self.seconds: dict[str, float] = {}
+
+    def run(self) -> Attempt:
+        """Make the attempt."""
+        reason, sentence = None, "the part is open"
+        try:
+            self._attempt()
+        except Ended as end:
+            reason, sentence = end.reason, end.sentence
+        except UserError as error:
+            reason, sentence = Reason.DRIVER, str(error)
+        finally:
+            with contextlib.suppress(Exception):  # the driver may be what has failed
+                self.mover.stop(3)
+            with contextlib.suppress(Exception):
+                self.driver.suction(False)
+        if reason is not None and self.opened is not None and self.result.get("moved"):
+            self.result["opened"] = self.opened()
+            reason = None if self.result["opened"] else reason
+        self.say(sentence)
+        trace = self.mover.feeling.trace
+        return Attempt(
+            **self.result,
+            reason=reason,
+            sentence=sentence,
+            seconds=self.seconds,
+            times=np.array([row[0] for row in trace]),
+            forces=np.array([row[1] for row in trace]).reshape(-1, 3),
+            tips=np.array([row[2] for row in trace]).reshape(-1, 3),
+        )
+
+    @contextlib.contextmanager
+    def _timed(self, name: str, clock: Callable[[], float] = time.perf_counter) -> Iterator[None]:
+        began = clock()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + clock() - began
+
+    def _now(self) -> float:
+        return self.driver.joints().time
+
+    def _attempt(self) -> None:
+        seen = self._look(dense=True)
+        motion = self._contact(seen)
+        with self._timed("way", self._now):
+            self._go(seen, motion)
+        with self._timed("approach", self._now):
+            felt = self.mover.touch(motion.velocity)
+            self.result |= {"touched": True, "felt": felt}
+            off = 1000 * float(np.linalg.norm(felt - motion.at))
+            self.say(f"touched, {off:.0f} mm from the contact that was chosen")
+            self.mover.hold()
+        self.result["sealed"] = True
+        self.say("the cup holds")
+        pull = Pull(self.mover, Motion(felt, motion.velocity, motion.turn), self._look_again, self.opened)
+        try:
+            with self._timed("pull", self._now):
+                pulled = pull.run()
+        finally:
+            self.result |= {"way": pull.way, "moved": pull.way >= MOVED}
+        self.result["opened"] = pulled.opened
+
+    def _look(self, dense: bool, holding: bool = False, force: Array | None = None) -> Seen:
+        try:
+            with self._timed("looking"):
+                seen = look(self.driver, self.sight, self.camera, self.options.points, self.rng, holding, force, dense)
+        except Ended as end:
+            self.result.setdefault("seen", end.reason == Reason.NO_OBJECT)
+            raise
+        self.result |= {"seen": True, "segmented": True}
+        return seen
+
+    def _contact(self, seen: Seen) -> Motion:
+        """Where to touch, and how the part moves there."""
+        self.say(f"saw {len(seen.dense)} points of an object")
+        with self._timed("predicting"):
+            flow = predicted(self.predictor, seen.observation)
+        with self._timed("choosing"):
+            dense = spread(seen.dense, seen.observation, flow)
+            place = choose_place(seen.dense, dense, self.camera[:3, 3], self.options.cup, self.options.place)
+        if place is None:
+            raise Ended(Reason.NO_PLACE, "nowhere on what moves is there room for the cup: all is too curved or a rim")
+        contact = seen.dense[place.row]
+        motion = motion_at(seen.observation.points, flow, contact)
+        if motion is None:
+            motion = Motion(contact, dense[place.row] / np.linalg.norm(dense[place.row]), np.zeros(3))
+        self.result["contact"] = contact
+        x, y, z = contact
+        turning = "turns" if np.linalg.norm(motion.turn) > 0.5 else "slides"
+        self.say(f"chose the contact ({x:.3f}, {y:.3f}, {z:.3f}) m; the part {turning} as it seems")
+        return motion
+
+    def _go(self, seen: Seen, motion: Motion) -> None:
+        """Plan to before the contact, and move there."""
+        state, o = self.driver.joints(), self.options
+        with self._timed("planning"):
+            cells = np.unique(np.round(seen.dense / SPACING), axis=0, return_index=True)[1]
+            cloud = seen.dense[np.sort(cells)]
+            reached = before_contact(self.arm, state.position, motion, cloud, self.camera[:3, 3], o.standoff, self.seed)
+            obstacles = Obstacles(cell(self.camera[:3, 3]), cloud, RADIUS)
+            found = plan(
+                self.arm, obstacles, state.position, reached.poses, self.seed, margin=MARGIN, goals=reached.goals
+            )
+            if found.path is None or found.failure is not None:
+                raise Ended(_PLANNING[found.failure or Failure.TIMEOUT], found.reason)
+            motion_in_time = timed(self.arm, found.path, Checker(self.arm, obstacles, MARGIN))
+        self.result["planned"] = True
+        self.say(f"planned a motion of {motion_in_time.duration:.1f} s")
+        self.mover.along(motion_in_time)
+
+    def _look_again(self, force: Array, tip: Array) -> Motion | Array | None:
+        """The part's motion at the held point as it is seen now; None where the arm hides the part."""
+        try:
+            seen = self._look(dense=False, holding=True, force=force)
+            with self._timed("predicting"):
+                if self.puller is not None:
+                    return np.asarray(self.puller(seen.observation), dtype=np.float64)
+                flow = predicted(self.predictor, seen.observation)
+        except Ended as end:
+            if end.reason in (Reason.NO_OBJECT, Reason.NO_FLOW):
+                return None
+            raise
+        return motion_at(seen.observation.points, flow, tip)
