@@ -166,19 +166,16 @@ def seal(
     normal = np.array([-slope[0], -slope[1], 1.0]) @ frame
     normal /= np.linalg.norm(normal)
     cosine = float(-normal @ approach / np.linalg.norm(approach))
-    off = float(normal @ np.asarray(force))
-    left = max(cup.hold - off, 1e-9)
-    along = float(np.linalg.norm(np.asarray(force) - off * normal))
-    tipping = float(np.linalg.norm(np.cross(normal, np.asarray(moment))))
+    pull, shear, peel = loads(normal, np.asarray(force), np.asarray(moment), cup)
     terms = {
         "gap": gap,
         "ring": ring,
         "mouth": mouth,
         "angle": math.degrees(math.acos(min(1.0, max(-1.0, cosine)))),
         "bend": _bend(local, cup.radius),
-        "pull": max(off, 0.0) / cup.hold,
-        "shear": along / max(cup.friction * left, 1e-9),
-        "peel": tipping / (left * cup.radius / 2.0),
+        "pull": pull,
+        "shear": shear,
+        "peel": peel,
     }
     least = {"ring": cup.ring, "mouth": cup.mouth, "bend": cup.bend}
     most = {"gap": cup.gap, "angle": cup.angle, "pull": 1.0, "shear": 1.0, "peel": 1.0}
@@ -186,6 +183,23 @@ def seal(
         name for name, value in terms.items() if value < least.get(name, -1.0) or value > most.get(name, math.inf)
     )
     return Seal(normal, **terms, failed=failed)
+
+
+def loads(normal: Array, force: Array, moment: Array, cup: CupOptions) -> tuple[float, float, float]:
+    """Pull, shear and peel of :class:`Seal`: what a cup bears, as shares of what it can.
+
+    Args:
+        normal: [3] unit, of the lip's plane, to the cup's side.
+        force: [3] N, with which the cup pulls the surface.
+        moment: [3] Nm about the middle of the lip, likewise.
+        cup: the cup.
+    """
+    off = float(normal @ force)
+    left = max(cup.hold - off, 1e-9)
+    along = float(np.linalg.norm(force - off * normal))
+    tipping = float(np.linalg.norm(np.cross(normal, moment)))
+    shear = along / max(cup.friction * left, 1e-9)
+    return max(off, 0.0) / cup.hold, shear, tipping / (left * cup.radius / 2.0)
 
 
 def _lip(local: Array, radius: float, smoothing: float) -> tuple[float, float, float, Array]:

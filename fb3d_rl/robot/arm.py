@@ -21,6 +21,7 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link
 from fb3d_rl.assets.partnet_mobility import named_errors
 from fb3d_rl.errors import UserError
+from fb3d_rl.geometry.transforms import axis_angle_to_matrix
 from fb3d_rl.importer.files import Source
 from fb3d_rl.importer.reading import FileReader
 from fb3d_rl.kinematics.tree import KinematicTree
@@ -82,7 +83,15 @@ class Arm:
 
     def forward(self, q: Tensor) -> Tensor:
         """T_base_link [..., J + 2, 4, 4] of base, links and tip at joint states [..., J]."""
-        return self.tree.forward(q)
+        # What the tree does joint by joint, for the joints of a row at once: it is asked in every control step.
+        axes, origins = self.tree.axes[1:-1], self.tree.origins
+        q = q.to(axes)
+        moved = origins[1:-1].expand(*q.shape, 4, 4).clone()
+        moved[..., :3, :3] @= axis_angle_to_matrix(axes.expand(*q.shape, 3), q)
+        poses = [origins[0].expand(*q.shape[:-1], 4, 4)]
+        for own in moved.unbind(-3):
+            poses.append(poses[-1] @ own)
+        return torch.stack([*poses, poses[-1] @ origins[-1]], dim=-3)
 
     def tip(self, q: Tensor) -> Tensor:
         """T_base_tip [..., 4, 4] at joint states [..., J]."""

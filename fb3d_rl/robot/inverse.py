@@ -127,7 +127,7 @@ def solve(arm: Arm, targets: Tensor, start: Tensor | None = None, starts: int = 
             break
         e, j = weight * error, weight[:, None] * jacobian
         damping = 0.5 * e.square().sum(-1, keepdim=True) + 1e-6
-        lever = torch.linalg.solve(j @ j.mT + torch.diag_embed(damping.expand(-1, 6)), j).mT  # [R S, J, 6]
+        lever = solved(j @ j.mT + torch.diag_embed(damping.expand(-1, 6)), j).mT  # [R S, J, 6]
         centring = CENTRING * (middle - q)
         step = (lever @ (e - (j @ centring[..., None]).squeeze(-1))[..., None]).squeeze(-1) + centring
         step = step * (STRIDE / step.abs().amax(-1, keepdim=True).clamp_min(STRIDE))
@@ -140,6 +140,11 @@ def solve(arm: Arm, targets: Tensor, start: Tensor | None = None, starts: int = 
         error[:, :3].norm(dim=-1).view(shape),
         error[:, 3:].norm(dim=-1).view(shape),
     )
+
+
+def solved(matrices: Tensor, sides: Tensor) -> Tensor:
+    """Solutions of many small systems; NumPy's, since torch's wait for their threads on a busy machine."""
+    return torch.from_numpy(np.linalg.solve(matrices.numpy(), sides.numpy()))
 
 
 def _close(error: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor
 from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import Arm
 from fb3d_rl.robot.collision import Checker, Obstacles
-from fb3d_rl.robot.inverse import STARTS, Solutions, solve
+from fb3d_rl.robot.inverse import STARTS, Solutions, pose_error, solve
 from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
@@ -77,6 +77,7 @@ def plan(
     seed: int = 0,
     timeout: float = 10.0,
     margin: float = 0.005,
+    goals: Array | None = None,
 ) -> Plan:
     """A path to any of several poses of the tip that touches nothing; the same for the same arguments and seed.
 
@@ -90,6 +91,7 @@ def plan(
         seed: of all that is drawn.
         timeout: for the search, s.
         margin: to keep from everything, m; given up where the start is nearer than that, but free.
+        goals: joint states [G, J] that bring the tip to one of the poses, the preferred first; searched unless given.
 
     Raises:
         UserError: a number is not finite.
@@ -98,12 +100,19 @@ def plan(
     here = np.asarray(start, dtype=np.float64)
     if not (np.isfinite(here).all() and bool(torch.isfinite(poses).all())):
         raise UserError("the arm's joint state, or a pose that it is to go to, is not finite")
-    result = _planned(arm, obstacles, here, poses, seed, began + timeout, margin)
+    result = _planned(arm, obstacles, here, poses, seed, began + timeout, margin, goals)
     return Plan(**{**vars(result), "seconds": time.monotonic() - began})
 
 
 def _planned(
-    arm: Arm, obstacles: Obstacles, here: Array, poses: Tensor, seed: int, deadline: float, margin: float
+    arm: Arm,
+    obstacles: Obstacles,
+    here: Array,
+    poses: Tensor,
+    seed: int,
+    deadline: float,
+    margin: float,
+    given: Array | None,
 ) -> Plan:
     if not bool(arm.within(torch.as_tensor(here))):
         return Plan(None, Failure.START_LIMITS, "the arm's joint state is beyond its limits; bring it back within them")
@@ -112,38 +121,42 @@ def _planned(
         sentence = f"the arm is in collision where it starts, by {100 * touching:.1f} cm; move it away by hand"
         return Plan(None, Failure.START, sentence)
     checker = Checker(arm, obstacles, min(margin, -touching))
+    if given is not None:
+        return _to_goals(arm, checker, here, given, poses, seed, deadline)
     for search, starts in enumerate(SEARCHES):
         solutions = solve(arm, poses, torch.as_tensor(here), starts, derived(seed, "inverse", search))
-        goals, which = _distinct(solutions, here)
+        goals = distinct(solutions, here)
         free = checker.free(goals) if len(goals) else np.zeros(0, dtype=bool)
         if free.any():
-            break
-    else:
-        if (why := solutions.reason()) is not None:
-            return Plan(None, Failure.UNREACHABLE, why)
-        sentence = f"the arm would touch something at its goal, in all of the {len(goals)} joint states found for it"
-        return Plan(None, Failure.GOAL, sentence)
+            return _to_goals(arm, checker, here, goals[free], poses, seed, deadline)
+    if (why := solutions.reason()) is not None:
+        return Plan(None, Failure.UNREACHABLE, why)
+    sentence = f"the arm would touch something at its goal, in all of the {len(goals)} joint states found for it"
+    return Plan(None, Failure.GOAL, sentence)
+
+
+def _to_goals(arm: Arm, checker: Checker, here: Array, goals: Array, poses: Tensor, seed: int, deadline: float) -> Plan:
+    """The plan to any of some joint states [G, J]."""
     rng = np.random.default_rng(derived(seed, "path"))
-    trees = _Tree(here[None]), _Tree(goals[free])
+    trees = _Tree(here[None]), _Tree(goals)
     path = _connect(arm, checker, trees, rng, deadline)
     nodes = sum(len(tree) for tree in trees)
     if path is None:
         sentence = f"no way to the goal was found within the time and {NODES} joint states; {nodes} were looked at"
         return Plan(None, Failure.TIMEOUT, sentence, nodes=nodes)
-    goal = int(which[np.abs(goals - path[-1]).sum(1).argmin()])
-    return Plan(_shortened(checker, path, rng), goal=goal, nodes=nodes)
+    off = pose_error(arm.tip(torch.as_tensor(path[-1])).expand_as(poses), poses)
+    return Plan(_shortened(checker, path, rng), goal=int(off.norm(dim=-1).argmin()), nodes=nodes)
 
 
-def _distinct(solutions: Solutions, here: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Joint states [G, J] that reach a pose, the nearest first, and the pose [G] that each reaches."""
+def distinct(solutions: Solutions, here: Array) -> Array:
+    """Joint states [G, J] that reach a pose, the nearest to ``here`` [J] first."""
     q = solutions.q[solutions.reached].numpy()
-    which = solutions.reached.nonzero()[:, 0].numpy()
     order = np.linalg.norm(q - here, axis=1).argsort(kind="stable")
     kept: list[int] = []
     for i in order:
         if all(np.abs(q[i] - q[k]).max() > 0.05 for k in kept):
             kept.append(int(i))
-    return q[kept], which[kept]
+    return np.asarray(q[kept])
 
 
 class _Tree:
