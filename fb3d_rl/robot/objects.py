@@ -128,7 +128,7 @@ def on_table(listed: Listed, obj: ArticulatedObject, place: tuple[float, float, 
     """The object of :func:`make`, closed, at x, y (m) and a turn (rad) on the table."""
     (link,) = obj.movable
     masses = [listed.part if i == link else listed.body if other.visuals else 0.0 for i, other in enumerate(obj.links)]
-    start = opening_range(obj)[0]
+    start = opening_range(obj)[0].tolist()
     return TableObject(obj, link, start, place, masses, FRICTION[listed.joint], DAMPING[listed.joint])
 
 

@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion
+from fb3d_rl.models.artflownet import POINTS
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.interaction import InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import Learner
@@ -35,6 +37,13 @@ Array = NDArray[np.float64]
 
 Truth: TypeAlias = Callable[[NDArray[Any]], Array]
 """The true flow [N, 3] of points [N, 3] of the part to open, 0 on all else; of a simulated cell."""
+
+SMOOTHED = 16
+"""Points around one that tell where the surface is."""
+
+NEIGHBORS = 8
+"""A point's flow is the median of those of so many points nearest to it: single points that a camera misplaced may have
+any flow, also the largest."""
 
 FLOW = ("prediction", "flow")
 TRUE_FLOW = ("privileged", "flow")
@@ -84,11 +93,12 @@ class PolicyFlow:
         self._look: TensorDictModuleBase | None = None
         if isinstance(policy, FlowPolicy) and policy.flow_key == TRUE_FLOW:
             return
-        if not (isinstance(policy, TensorDictSequential) and FLOW in policy.out_keys):
+        if isinstance(policy, TensorDictSequential):
+            self._look = TensorDictSequential(*policy.module[:-1])  # the last one moves the gripper
+        if self._look is None or FLOW not in self._look.out_keys:
             raise UserError(
                 "the robot's trials are for policies of a flow, and for learners with algo.oracle=true: choose one"
             )
-        self._look = policy.select_subsequence(out_keys=[FLOW])
         self._masked = mask_of(policy) == "target"
         self._state = initial_state(policy, torch.Size([1]))
 
@@ -98,13 +108,38 @@ class PolicyFlow:
             return self._truth(seen.points)
         if self._frame is None or not seen.holding:
             self._frame = Frame.of(seen)
-        data = observed(seen, self._frame, self._truth(seen.points)).update(self._state)
+        few = thinned(seen)
+        data = observed(few, self._frame, self._truth(few.points)).update(self._state)
         with steady_floats(), torch.no_grad():
             self._look(data)
         flow = data[FLOW][0]
         if self._masked:
             flow = flow * data["observation", "part_mask"][0, :, None]
-        return np.asarray(flow.double().numpy() @ self._frame.turn)
+        nearby = _nearest(few.points, seen.points, NEIGHBORS)
+        return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
+
+
+def thinned(seen: Observation) -> Observation:
+    """As many points as policies know, of the smoothed ones, which are in random order."""
+    return replace(seen, points=smoothed(seen.points)[:POINTS])
+
+
+def smoothed(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points [N, 3] moved along the normal of the plane that fits those around each, to their median height.
+
+    Networks that were trained on exact clouds see objects much enlarged, and with them the camera's noise.
+    """
+    around = points[_nearest(points, points, SMOOTHED)].astype(np.float64)
+    apart = around - around.mean(1, keepdims=True)
+    normals = np.linalg.eigh(apart.swapaxes(1, 2) @ apart)[1][:, :, 0]
+    heights = ((around - points[:, None]) @ normals[:, :, None]).squeeze(-1)
+    return np.asarray(points + np.median(heights, axis=1)[:, None] * normals, dtype=np.float32)
+
+
+def _nearest(points: NDArray[Any], at: NDArray[Any], count: int) -> NDArray[np.int64]:
+    """Places [M, count] of the points [N, 3] nearest to others [M, 3]."""
+    found = cKDTree(points).query(at, range(1, min(count, len(points)) + 1))[1]
+    return np.asarray(found, dtype=np.int64)
 
 
 class LearnerPull:
@@ -134,6 +169,7 @@ class LearnerPull:
     def __call__(self, seen: Observation) -> Array:
         """The tip's velocity (m/s) and angular velocity (rad/s) [6] in the base."""
         frame = self._frame = self._frame or Frame.of(seen)
+        seen = thinned(seen)
         data = observed(seen, frame, self._truth(seen.points)).update(self._state)
         place = data["observation", "tool_pose"][:, :3]
         data["observation", "qpos"] = torch.cat([place, torch.zeros(1, 5)], -1)

@@ -45,6 +45,7 @@ class RobotRow:
         opened: whether it was open by more than 90 % of its range at the end; the success.
         reason: why the attempt ended before that, in a word that can be counted.
         sentence: the same for people.
+        cup: the terms of :class:`~fb3d_rl.perception.suction.Seal` that kept the cup from holding, or tore it off.
         distance: share of the opening that is left, |q_goal - q| / |q_goal - q_start|.
         way: how far the held point moved, m.
         off: how far the touch was from the chosen contact, m; -1 without a touch.
@@ -79,6 +80,7 @@ class RobotRow:
     opened: bool = False
     reason: str = ""
     sentence: str = ""
+    cup: str = ""
     distance: float = 1.0
     way: float = 0.0
     off: float = -1.0

@@ -45,6 +45,13 @@ OPEN = 0.1
 ENOUGH = 0.02
 """A pull ends when less than this is left: the distance that is measured is not that of the first success."""
 
+SEEN = 4800
+"""Points of an attempt's cloud: policies see fewer, which these smooth."""
+
+SLANT = 20.0
+"""Largest angle between the flow and the surface at the contact, degrees: the cup comes along the flow and seals up to
+25, of which the errors of camera and flow take some."""
+
 LEARNER_LOOKS = 0.25
 """Time between two answers of a learner in a pull, s: it steers by itself, while a flow tells how to go on."""
 
@@ -125,7 +132,8 @@ def attempt_options(options: RobotOptions, learner: bool = False) -> AttemptOpti
     defaults = AttemptOptions()
     return replace(
         defaults,
-        place=replace(defaults.place, rim=options.rim),
+        place=replace(defaults.place, rim=options.rim, slant=SLANT if options.rim else 90.0),
+        points=SEEN,
         look_every=LEARNER_LOOKS if learner else defaults.look_every,
     )
 
@@ -181,7 +189,7 @@ def run_trial(
         distance, seconds = cell.distance(), cell.joints().time
     finally:
         torch.set_num_threads(threads)
-    passed = {stage: bool(getattr(made, stage)) for stage in STAGES}
+    passed: dict[str, Any] = {stage: bool(getattr(made, stage)) for stage in STAGES}
     passed["opened"] = made.moved and distance < OPEN
     off = float(np.linalg.norm(made.felt - made.contact))
     return replace(
@@ -189,6 +197,7 @@ def run_trial(
         **passed,
         reason="" if made.reason is None or passed["opened"] else made.reason.value,
         sentence=made.sentence,
+        cup=" ".join(cell.cup.torn or (() if made.sealed or cell.cup.seal is None else cell.cup.seal.failed)),
         distance=distance if made.sealed else 1.0,
         way=made.way,
         off=off if np.isfinite(off) else -1.0,

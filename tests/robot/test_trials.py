@@ -17,12 +17,14 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.policies.baselines import random_policy
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis
-from fb3d_rl.policies.options import FlowPolicyOptions
+from fb3d_rl.policies.interaction import InteractivePolicy, OracleGate
+from fb3d_rl.policies.learner import Learner
+from fb3d_rl.policies.options import FlowPolicyOptions, LearnerOptions
 from fb3d_rl.robot import trials
 from fb3d_rl.robot.attempt import Observation
 from fb3d_rl.robot.objects import TABLE_I
 from fb3d_rl.robot.options import RobotOptions
-from fb3d_rl.robot.predictors import Frame, PolicyFlow, observed
+from fb3d_rl.robot.predictors import Frame, PolicyFlow, asking, observed, smoothed
 from fb3d_rl.robot.rows import RobotRow
 from fb3d_rl.robot.trials import RobotTrial, blank_rows, key_of, run_trials, schedule, session_of
 
@@ -173,6 +175,58 @@ def test_a_policy_with_the_mask_moves_the_part_alone() -> None:
     truth[:30, 2] = 1.0
     flow = PolicyFlow(predicting("target"), lambda points: truth)(seen)
     assert flow[:30].any(1).all() and not flow[30:].any()
+
+
+def test_smoothing_brings_points_back_to_their_plane_and_leaves_exact_ones() -> None:
+    seen, normal = box(-0.8, (0.7, 0.1))
+    exact = seen.points.astype(np.float64)
+    inner = np.abs(exact[:196] - exact[:196].mean(0)).max(1) < 0.08  # of the front, away from the edge to the top
+    noisy = exact + 0.003 * np.random.default_rng(0).normal(size=exact.shape)
+    before, after = ((cloud - exact) @ normal for cloud in (noisy, smoothed(noisy.astype(np.float32))))
+    assert np.std(after[:196][inner]) < 0.5 * np.std(before[:196][inner])
+    assert smoothed(seen.points)[:196][inner] == pytest.approx(exact[:196][inner], abs=1e-5)
+
+
+def test_a_single_point_with_another_flow_is_outvoted() -> None:
+    """A network that has one point move the other way, and most."""
+
+    def odd(points: torch.Tensor) -> torch.Tensor:
+        flow = outwards(points)
+        flow[:, 17] = torch.tensor([9.0, 0.0, 0.0])
+        return flow
+
+    module = TensorDictModule(odd, in_keys=[("observation", "points")], out_keys=[("prediction", "flow")])
+    policy = TensorDictSequential(module, FlowPolicy(("prediction", "flow"), LIMITS))
+    seen, normal = box(-0.8, (0.7, 0.1))
+    flow = PolicyFlow(policy, lambda points: np.ones((len(points), 3)))(seen)
+    assert (flow @ normal > 0).all() and np.linalg.norm(flow, axis=1).max() < 1.01
+
+
+def test_a_learner_pulls_as_it_would_in_its_own_task(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is shown a hand that it knows how to move; its twist comes back in the robot's frame, at the robot's speed."""
+    seen, normal = box(-0.8, (0.7, 0.1), holding=True)
+    learner = Learner(LearnerOptions(), LIMITS, torch.Generator().manual_seed(0))
+    twist = torch.tensor([[[-1.0, 0.0, 0.0, 0.0, 0.0, 0.4]]])  # to where the box's front faces, and a turn about z
+    felt: list[torch.Tensor] = []
+
+    def network(points: torch.Tensor, features: torch.Tensor, valid: torch.Tensor, hand: torch.Tensor) -> torch.Tensor:
+        felt.append(hand)
+        return twist.expand(1, learner.options.chunk, 6)
+
+    monkeypatch.setattr(learner, "network", torch.nn.Identity())
+    monkeypatch.setattr(learner.network, "forward", network)
+    policy = InteractivePolicy(expert_policy(LIMITS), learner, OracleGate())
+    truth = np.zeros((len(seen.points), 3))
+    truth[:50] = normal
+    see, pull = asking(policy, lambda points: truth, 0.05)
+    assert np.array_equal(see(seen), truth) and pull is not None
+    answer = pull(seen)
+    assert answer[:3] == pytest.approx(0.05 * normal, abs=2e-3)
+    turn = LIMITS.angular / LIMITS.linear * Frame.of(seen).scale * 0.05 * 0.4
+    assert np.linalg.norm(answer[3:]) <= turn + 1e-6  # about z, what turns the hand: not its spin
+    pull(seen)
+    still, moving = (hand[0, 0, 3:6].double() for hand in felt)
+    assert still.abs().max() == 0 and moving.numpy() == pytest.approx([-1.0, 0.0, 0.0], abs=1e-5)
 
 
 def test_the_expert_is_the_truth_and_a_policy_without_flow_is_refused() -> None:
