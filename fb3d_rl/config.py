@@ -148,7 +148,9 @@ def validate(cfg: CommandConfig) -> None:
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
-    if isinstance(cfg, EvaluateConfig) and cfg.robot.used:
+    if isinstance(cfg, TrainConfig) and cfg.evaluation.robot:
+        raise UserError("protocol=robot is for launch/evaluate.py: train, then evaluate with checkpoint=RUN")
+    if isinstance(cfg, EvaluateConfig) and cfg.evaluation.robot:
         cfg.robot.depth_noise()  # refuses unknown terms
         if cfg.collector.backend == "ray":
             raise UserError("protocol=robot runs in processes of this machine: give collector=process or direct")

@@ -55,7 +55,7 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     setup.choose_device(cfg.device)  # a missing device is an error before anything is read
     chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)
-    protocol = None if cfg.robot.used else setup.protocol(cfg, cfg.resume)
+    protocol = None if cfg.evaluation.robot else setup.protocol(cfg, cfg.resume)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     policies = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     made, facts = chosen.policy(limits, speeds), setup.facts(cfg)

@@ -12,9 +12,8 @@ from fb3d_rl.options import option
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """Trials of a robot arm in its cell, in place of the floating gripper's: protocol=robot."""
+    """Trials of a robot arm in its cell: of protocol=robot alone."""
 
-    used: bool = option(False, "whether trials are the robot's; protocol=robot sets it")
     arm: Literal["sawyer", "panda"] = option("sawyer", "the arm")
     trials: int = option(5, "trials of each object, each with a pose of its own", within="[1, inf)")
     noise: str = option("azure_kinect", "the depth camera's errors", among=PRESETS)

@@ -30,8 +30,8 @@ from fb3d_rl.robot.trials import RobotTrial, blank_rows, key_of, run_trials, sch
 
 Array = NDArray[np.float64]
 LIMITS = VelocityLimits(0.5, 1.0)
-OPTIONS = RobotOptions(used=True)
-IDEAL = RobotOptions(used=True, noise="exact", calibration_deg=0.0, calibration_mm=0.0, seal=False, force_noise=False)
+OPTIONS = RobotOptions()
+IDEAL = RobotOptions(noise="exact", calibration_deg=0.0, calibration_mm=0.0, seal=False, force_noise=False)
 
 
 def test_every_object_has_its_trials_and_a_pose_of_its_own_in_each() -> None:
