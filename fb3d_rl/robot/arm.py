@@ -21,7 +21,7 @@ from torch import Tensor
 from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link
 from fb3d_rl.assets.partnet_mobility import named_errors
 from fb3d_rl.errors import UserError
-from fb3d_rl.geometry.transforms import axis_angle_to_matrix, rigid
+from fb3d_rl.geometry.transforms import axis_angle_to_matrix
 from fb3d_rl.importer.files import Source
 from fb3d_rl.importer.reading import FileReader
 from fb3d_rl.kinematics.tree import KinematicTree
@@ -86,8 +86,8 @@ class Arm:
         # What the tree does joint by joint, for the joints of a row at once: it is asked in every control step.
         axes, origins = self.tree.axes[1:-1], self.tree.origins
         q = q.to(axes)
-        turns = axis_angle_to_matrix(axes.expand(*q.shape, 3), q)
-        moved = origins[1:-1] @ rigid(turns, torch.zeros_like(axes).expand(*q.shape, 3))
+        moved = origins[1:-1].expand(*q.shape, 4, 4).clone()
+        moved[..., :3, :3] @= axis_angle_to_matrix(axes.expand(*q.shape, 3), q)
         poses = [origins[0].expand(*q.shape[:-1], 4, 4)]
         for own in moved.unbind(-3):
             poses.append(poses[-1] @ own)

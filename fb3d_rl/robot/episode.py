@@ -14,21 +14,24 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.perception.suction import choose_place
 from fb3d_rl.robot.arm import Arm
 from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Ended, Predictor, Puller, Reason
-from fb3d_rl.robot.collision import Checker, Obstacles
+from fb3d_rl.robot.collision import Checker
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.motion import MOVED, Mover, Pull
 from fb3d_rl.robot.planning import Failure, plan
-from fb3d_rl.robot.reach import MARGIN, RADIUS, before_contact
+from fb3d_rl.robot.reach import MARGIN, before_contact, obstacles_of
 from fb3d_rl.robot.seeing import Motion, Seen, look, motion_at, predicted, spread
 from fb3d_rl.robot.sight import ArmSight
+from fb3d_rl.robot.timing import Motion as Timed
 from fb3d_rl.robot.timing import timed
-from fb3d_rl.robot.workspace import cell
 from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
 
-SPACING = 0.01
-"""Between the points of the object's cloud as obstacles, m."""
+_ELSEWHERE = (Reason.UNREACHABLE, Reason.GOAL_COLLISION, Reason.APPROACH_COLLISION, Reason.TIMEOUT)
+"""With these another contact may fare better."""
+
+PART = 0.2
+"""A point is the part's whose flow has this share of the largest."""
 
 _PLANNING = {
     Failure.START_LIMITS: Reason.START_LIMITS,
@@ -133,9 +136,12 @@ class _Run:
 
     def _attempt(self) -> None:
         seen = self._look(dense=True)
-        motion = self._contact(seen)
+        self.say(f"saw {len(seen.dense)} points of an object")
+        with self._timed("predicting"):
+            flow = predicted(self.predictor, seen.observation)
+        motion, way = self._plan(seen, flow)
         with self._timed("way", self._now):
-            self._go(seen, motion)
+            self.mover.along(way)
         with self._timed("approach", self._now):
             felt = self.mover.touch(motion.velocity)
             self.result |= {"touched": True, "felt": felt}
@@ -162,43 +168,61 @@ class _Run:
         self.result |= {"seen": True, "segmented": True}
         return seen
 
-    def _contact(self, seen: Seen) -> Motion:
+    def _plan(self, seen: Seen, flow: Array) -> tuple[Motion, Timed]:
+        """A contact, the part's motion there, and a way to before it; where there is none, the next best contacts."""
+        dense = spread(seen.dense, seen.observation, flow)
+        failed: Ended | None = None
+        for _ in range(self.options.contacts):
+            try:
+                motion = self._contact(seen, flow, dense)
+                with self._timed("planning"):
+                    way = self._way(seen, motion)
+            except Ended as end:
+                if end.reason == Reason.NO_PLACE and failed is not None:
+                    break
+                if end.reason not in _ELSEWHERE:
+                    raise
+                failed = failed or end
+                away = np.linalg.norm(seen.dense - motion.at, axis=1) > self.options.apart
+                dense = np.where(away[:, None], dense, 0.0)
+                continue
+            self.result |= {"planned": True, "contact": motion.at}
+            x, y, z = motion.at
+            turns = "turns" if np.linalg.norm(motion.turn) > 0.5 else "slides"
+            self.say(f"the part seems to {turns[:-1]}; planned {way.duration:.1f} s to ({x:.3f}, {y:.3f}, {z:.3f}) m")
+            return motion, way
+        assert failed is not None
+        raise failed
+
+    def _contact(self, seen: Seen, flow: Array, dense: Array) -> Motion:
         """Where to touch, and how the part moves there."""
-        self.say(f"saw {len(seen.dense)} points of an object")
-        with self._timed("predicting"):
-            flow = predicted(self.predictor, seen.observation)
         with self._timed("choosing"):
-            dense = spread(seen.dense, seen.observation, flow)
-            place = choose_place(seen.dense, dense, self.camera[:3, 3], self.options.cup, self.options.place)
+            size = np.linalg.norm(dense, axis=1)
+            # What does not move is none of the part: where a door lies flush in its frame, its border is a rim.
+            part = np.flatnonzero(size > PART * size.max())
+            place = None
+            if len(part):
+                points = seen.dense[part]
+                place = choose_place(points, dense[part], self.camera[:3, 3], self.options.cup, self.options.place)
         if place is None:
             raise Ended(Reason.NO_PLACE, "nowhere on what moves is there room for the cup: all is too curved or a rim")
-        contact = seen.dense[place.row]
+        row = part[place.row]
+        contact = seen.dense[row]
+        self.result.setdefault("contact", contact)
         motion = motion_at(seen.observation.points, flow, contact)
         if motion is None:
-            motion = Motion(contact, dense[place.row] / np.linalg.norm(dense[place.row]), np.zeros(3))
-        self.result["contact"] = contact
-        x, y, z = contact
-        turning = "turns" if np.linalg.norm(motion.turn) > 0.5 else "slides"
-        self.say(f"chose the contact ({x:.3f}, {y:.3f}, {z:.3f}) m; the part {turning} as it seems")
+            motion = Motion(contact, dense[row] / size[row], np.zeros(3))
         return motion
 
-    def _go(self, seen: Seen, motion: Motion) -> None:
-        """Plan to before the contact, and move there."""
-        state, o = self.driver.joints(), self.options
-        with self._timed("planning"):
-            cells = np.unique(np.round(seen.dense / SPACING), axis=0, return_index=True)[1]
-            cloud = seen.dense[np.sort(cells)]
-            reached = before_contact(self.arm, state.position, motion, cloud, self.camera[:3, 3], o.standoff, self.seed)
-            obstacles = Obstacles(cell(self.camera[:3, 3]), cloud, RADIUS)
-            found = plan(
-                self.arm, obstacles, state.position, reached.poses, self.seed, margin=MARGIN, goals=reached.goals
-            )
-            if found.path is None or found.failure is not None:
-                raise Ended(_PLANNING[found.failure or Failure.TIMEOUT], found.reason)
-            motion_in_time = timed(self.arm, found.path, Checker(self.arm, obstacles, MARGIN))
-        self.result["planned"] = True
-        self.say(f"planned a motion of {motion_in_time.duration:.1f} s")
-        self.mover.along(motion_in_time)
+    def _way(self, seen: Seen, motion: Motion) -> Timed:
+        """A motion to before the contact."""
+        here, eye = self.driver.joints().position, self.camera[:3, 3]
+        reached = before_contact(self.arm, here, motion, seen.dense, eye, self.options.standoff, self.seed)
+        obstacles = obstacles_of(seen.dense, eye)
+        found = plan(self.arm, obstacles, here, reached.poses, self.seed, margin=MARGIN, goals=reached.goals)
+        if found.path is None:
+            raise Ended(_PLANNING[found.failure or Failure.TIMEOUT], found.reason)
+        return timed(self.arm, found.path, Checker(self.arm, obstacles, MARGIN))
 
     def _look_again(self, force: Array, tip: Array) -> Motion | Array | None:
         """The part's motion at the held point as it is seen now; None where the arm hides the part."""

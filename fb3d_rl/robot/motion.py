@@ -17,7 +17,7 @@ from fb3d_rl.robot.driver import Driver, JointState
 from fb3d_rl.robot.inverse import pose_error
 from fb3d_rl.robot.seeing import Motion
 from fb3d_rl.robot.timing import Motion as Timed
-from fb3d_rl.robot.velocity import resolve
+from fb3d_rl.robot.velocity import resolve, resolve_cup
 
 Array = NDArray[np.float64]
 
@@ -165,14 +165,19 @@ class Mover:
             forces.append(self.feeling.raw())
         self.feeling.zero(forces)
 
-    def twist(self, state: JointState, velocity: Array, turn: Array) -> None:
+    def twist(self, state: JointState, velocity: Array, turn: Array, exactly: bool = False) -> None:
         """One control step with a velocity (m/s) and an angular velocity (rad/s) of the tip [3].
+
+        Where the arm cannot do all of it the cup tilts and twists, unless it is to be kept ``exactly``.
 
         Raises:
             Ended: joints at their limits have left little of it for a while.
         """
-        asked = torch.as_tensor(np.concatenate([velocity, turn]))
-        found = resolve(self.arm, torch.as_tensor(state.position), asked, self._itself)
+        q, asked = torch.as_tensor(state.position), torch.as_tensor(np.concatenate([velocity, turn]))
+        if exactly:
+            found = resolve(self.arm, q, asked, self._itself)
+        else:
+            found = resolve_cup(self.arm, q, asked[:3], asked[3:], self._itself)
         if found.share >= WEAK:
             self._weak_since = None
         elif self._weak_since is None:
@@ -302,7 +307,7 @@ class Pull:
             if np.linalg.norm(tip - marked) > FELT:
                 self._feel(marked, tip)
                 marked = tip
-            mover.twist(state, *self._command(pose, force, state.time - began))
+            mover.twist(state, *self._command(pose, force, state.time - began), self.twist is not None)
 
     def _check(self, state: JointState, force: Array, path: list[tuple[float, Array]], began: float) -> None:
         o, size = self.mover.options, float(np.linalg.norm(force))

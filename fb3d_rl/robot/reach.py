@@ -16,21 +16,25 @@ from fb3d_rl.geometry.transforms import rigid
 from fb3d_rl.robot.arm import CUP_RADIUS, Arm
 from fb3d_rl.robot.attempt import Ended, Reason
 from fb3d_rl.robot.collision import Checker, Obstacles
-from fb3d_rl.robot.inverse import SCALE, pose_error, precontact_poses, solve, solved
+from fb3d_rl.robot.inverse import pose_error, precontact_poses, solve
 from fb3d_rl.robot.planning import distinct
 from fb3d_rl.robot.seeing import Motion
+from fb3d_rl.robot.velocity import by_priority, cup_errors, cup_tasks
 from fb3d_rl.robot.workspace import cell
 from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
 
-RADIUS = 0.006
-"""Of the points of the object's cloud as obstacles, m: about half of their distance."""
+SPACING, RADIUS, MARGIN = 0.01, 0.006, 0.003
+"""Distance of the points of the object's cloud as obstacles, their radius, and what the arm keeps from them, m."""
 
-MARGIN = 0.003
-"""To keep from them, m."""
+FINE = 0.4
+"""All three are smaller by this factor near the contact, on the last way to it."""
 
-CONTACT = CUP_RADIUS + RADIUS + MARGIN + 0.004
+NEAR = 0.12
+"""So near, m: as far as cup and gripper reach."""
+
+CONTACT = CUP_RADIUS + FINE * (RADIUS + MARGIN) + 0.004
 """On the last way the cup may touch what is this near to the contact, m."""
 
 STEPS = 10
@@ -45,11 +49,30 @@ STRIDES = 24
 ROUNDS = 3
 """Steps of the inverse kinematics between two states of a way."""
 
-OFF = 0.004
-"""A tip that is further from its way (m, or rad times SCALE) does not follow it."""
+ROUND = 0.2
+"""The time that one of them stands for, s: how far joints come to the middle of their limits."""
+
+OFF = 0.003
+"""A tip that is further from its way (m) does not follow it."""
+
+TILT = 0.5
+"""Nor does a cup that is tilted more, rad; its bellows bear that."""
+
+STRAIGHT = 0.05
+"""On the last way to the contact it is tilted by less, rad."""
 
 CLOSE = 0.95
 """Of the joint states those are kept that follow the part this share as far as the best one."""
+
+
+def thinned(points: Array, spacing: float) -> Array:
+    """The first of the points [P, 3] in each cube of an edge of ``spacing`` m."""
+    return points[np.sort(np.unique(np.round(points / spacing), axis=0, return_index=True)[1])]
+
+
+def obstacles_of(cloud: Array, camera: Array) -> Obstacles:
+    """Cell and object as obstacles, of the object's dense cloud [P, 3] and the camera's place [3], m."""
+    return Obstacles(cell(camera), thinned(cloud, SPACING), RADIUS)
 
 
 class Reached(NamedTuple):
@@ -89,8 +112,7 @@ def before_contact(
     goals = distinct(solutions, here)
     if not len(goals):
         raise Ended(Reason.UNREACHABLE, str(solutions.reason()))
-    boxes = cell(camera)
-    free = Checker(arm, Obstacles(boxes, cloud, RADIUS), MARGIN).free(goals)
+    free = Checker(arm, obstacles_of(cloud, camera), MARGIN).free(goals)
     if not free.any():
         raise Ended(
             Reason.GOAL_COLLISION,
@@ -98,24 +120,36 @@ def before_contact(
             f"joint states found for it",
         )
     goals = goals[free]
-    away = cloud[np.linalg.norm(cloud - motion.at, axis=1) > CONTACT]
+    distance = np.linalg.norm(cloud - motion.at, axis=1)
+    near = thinned(cloud[(distance < NEAR) & (distance > CONTACT)], FINE * SPACING)
     way_in = torch.linspace(0.0, standoff, STEPS + 1, dtype=torch.float64)[1:]
     start = torch.as_tensor(goals)
     first = arm.tip(start)
     targets = first.repeat(STEPS, 1, 1, 1)
     targets[..., :3, 3] -= way_in[:, None, None] * way
     q, on = followed(arm, start, targets)
-    comes = on.all(0) & _clear(Checker(arm, Obstacles(boxes, away, RADIUS), MARGIN), q).all(0)
+    straight = on.all(0) & (_tilt(arm.tip(q), -way) < STRAIGHT).all(0)
+    clear = [
+        Checker(arm, obstacles_of(cloud[distance >= NEAR], camera), MARGIN),
+        Checker(arm, Obstacles((), near, FINE * RADIUS), FINE * MARGIN),
+    ]
+    comes = straight & torch.stack([_clear(checker, q) for checker in clear]).all(0).all(0)
     if not bool(comes.any()):
-        blocked = bool(on.all(0).any())
+        blocked = bool(straight.any())
         what = "would touch something" if blocked else "comes to its joints' limits"
         raise Ended(
             Reason.APPROACH_COLLISION if blocked else Reason.UNREACHABLE,
             f"on the straight way to the contact the arm {what}, from all of the {len(goals)} joint states before it",
         )
-    share = _follows(arm, q[-1][comes], targets[-1][comes], motion, Checker(arm, Obstacles(boxes), MARGIN))
+    touching = q[-1][comes]
+    share = _follows(arm, touching, arm.tip(touching), motion, Checker(arm, Obstacles(cell(camera)), MARGIN))
     kept = share >= CLOSE * share.max()
     return Reached(goals[comes.numpy()][kept], poses, float(share.max()))
+
+
+def _tilt(poses: Tensor, way: Tensor) -> Tensor:
+    """Angles [...] (rad) between the cup's axes at T_base_tip [..., 4, 4] and unit directions [..., 3]."""
+    return (poses[..., :3, 2] * way).sum(-1).clamp(-1.0, 1.0).arccos()
 
 
 def _clear(checker: Checker, q: Tensor) -> Tensor:
@@ -137,7 +171,7 @@ def _follows(arm: Arm, start: Tensor, touching: Tensor, motion: Motion, checker:
 
 
 def followed(arm: Arm, start: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Joint states that follow ways of the tip, as far as the joints' limits let them.
+    """Joint states in which a cup follows ways of the tip as :func:`~fb3d_rl.robot.velocity.resolve_cup` does.
 
     Args:
         arm: the arm.
@@ -145,18 +179,21 @@ def followed(arm: Arm, start: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
         targets: T_base_tip [S, G, 4, 4], near each other.
 
     Returns:
-        Joint states [S, G, J], and whether the tip is on its way [S, G].
+        Joint states [S, G, J], and whether the tip is on its way and the cup tilted by no more than it bears [S, G].
     """
     q, states, on = start, [], []
-    weight = torch.tensor([1.0] * 3 + [SCALE] * 3, dtype=q.dtype)
-    eye = 1e-6 * torch.eye(6, dtype=q.dtype)
     for target in targets:
         for _ in range(ROUNDS):
-            pose, jacobian = arm.pose_and_jacobian(q)
-            j = weight[:, None] * jacobian
-            error = (weight * pose_error(pose, target))[..., None]
-            step = (j.mT @ solved(j @ j.mT + eye, error)).squeeze(-1)
+            pose, tasks, rest = cup_tasks(arm, q)
+            error = pose_error(pose, target)
+            todo = cup_errors(pose, error[:, :3], error[:, 3:])
+            step = by_priority(tasks, todo, ROUND * rest, torch.ones_like(q, dtype=torch.bool))
+            free = (q + step >= arm.lower) & (q + step <= arm.upper)
+            if not bool(free.all()):
+                step = by_priority(tasks, todo, ROUND * rest, free)
             q = (q + step.clamp(-0.2, 0.2)).clamp(arm.lower, arm.upper)
         states.append(q)
-        on.append((weight * pose_error(arm.tip(q), target)).norm(dim=-1) < OFF)
+        pose = arm.tip(q)
+        off = (pose[:, :3, 3] - target[:, :3, 3]).norm(dim=-1)
+        on.append((off < OFF) & (_tilt(pose, target[:, :3, 2]) < TILT))
     return torch.stack(states), torch.stack(on)

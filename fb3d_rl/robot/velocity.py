@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,6 +30,13 @@ AHEAD = 0.02
 
 HELD = 0.01
 """A joint that is nearer to its limit (rad) than this and pushed towards it is held."""
+
+
+CENTRING = 0.5
+"""Joints go to the middle of their limits by this share of the way, 1/s, as far as a cup's motion leaves a choice."""
+
+SOFT = 1e-4
+"""Added to the squares of the Jacobians' singular values for a cup."""
 
 
 class Resolved(NamedTuple):
@@ -87,6 +96,96 @@ def resolve(arm: Arm, q: Tensor, twist: Tensor, checker: Checker | None = None, 
     asked = weight * twist
     share = float((weight * (jacobian @ velocity)) @ asked / (asked @ asked).clamp_min(1e-12))
     return Resolved(velocity, share, held, slowed)
+
+
+def resolve_cup(
+    arm: Arm, q: Tensor, velocity: Tensor, turn: Tensor, checker: Checker | None = None, speed: float = SPEED
+) -> Resolved:
+    """Joint velocities that move a cup as asked: its place first, then its tilt, then its turn about its own axis.
+
+    Bellows bear some tilt, and a lip some twist, so that an arm follows a part farther than :func:`resolve` does. What
+    is left of the choice brings the joints to the middle of their limits.
+
+    Args:
+        arm: the arm.
+        q: joint state [J], rad.
+        velocity: of the tip in the base's axes [3], m/s.
+        turn: its angular velocity [3], rad/s.
+        checker: as of :func:`resolve`.
+        speed: likewise.
+
+    Returns:
+        The share is that of ``velocity``.
+
+    Raises:
+        UserError: a number is not finite.
+    """
+    q, velocity, turn = (x.to(arm.home) for x in (q, velocity, turn))
+    if not bool(torch.isfinite(torch.cat([q, velocity, turn])).all()):
+        raise UserError("the arm's joint state, or the velocity that is asked of its tip, is not finite; stop the arm")
+    pose, tasks, rest = cup_tasks(arm, q[None])
+    asked = cup_errors(pose, velocity[None], turn[None])
+    least = (BRAKE * (arm.lower - q)).clamp_max(0.0)
+    most = (BRAKE * (arm.upper - q)).clamp_min(0.0)
+    found, fixed = torch.zeros_like(q), torch.zeros_like(q, dtype=torch.bool)
+    for _ in range(len(q)):
+        left = torch.where(fixed, found, 0.0)
+        todo = [x - task @ left for x, task in zip(asked, tasks, strict=True)]
+        found = torch.where(fixed, left, by_priority(tasks, todo, rest, ~fixed[None])[0])
+        beyond = ~fixed & ((found < least - 1e-12) | (found > most + 1e-12))
+        if not bool(beyond.any()):
+            break
+        found, fixed = torch.minimum(torch.maximum(found, least), most), fixed | beyond
+    held = fixed & (torch.minimum(q - arm.lower, arm.upper - q) < HELD)
+    found = found / max(float((found.abs() / arm.velocity.clamp_max(speed)).max()), 1.0)
+    slowed = 1.0 if checker is None else _slowed(checker, q, found)
+    found = slowed * found
+    share = float(((tasks[0][0] @ found) @ velocity) / (velocity @ velocity).clamp_min(1e-12))
+    return Resolved(found, share, held, slowed)
+
+
+def cup_tasks(arm: Arm, q: Tensor) -> tuple[Tensor, list[Tensor], Tensor]:
+    """What counts of a cup's motion, at joint states [B, J].
+
+    Returns:
+        T_base_tip [B, 4, 4]; Jacobians of its place [B, 3, J], its tilt about its own x and y [B, 2, J] and its turn
+        about its own axis [B, 1, J]; and joint velocities [B, J] to the middle of the limits.
+    """
+    pose, jacobian = arm.pose_and_jacobian(q)
+    own = pose[:, :3, :3].mT @ jacobian[:, 3:]
+    middle = (arm.lower + arm.upper) / 2
+    return pose, [jacobian[:, :3], own[:, :2], own[:, 2:]], CENTRING * (middle - q)
+
+
+def cup_errors(pose: Tensor, velocity: Tensor, turn: Tensor) -> list[Tensor]:
+    """A velocity and an angular velocity [B, 3] of the tip at T_base_tip [B, 4, 4], as the tasks of cup_tasks."""
+    own = (pose[:, :3, :3].mT @ turn[..., None]).squeeze(-1)
+    return [velocity, own[:, :2], own[:, 2:]]
+
+
+def by_priority(tasks: Sequence[Tensor], wanted: Sequence[Tensor], rest: Tensor, free: Tensor) -> Tensor:
+    """Joint steps [B, J] that fulfil tasks in turn, each as far as those before it leave a choice.
+
+    Args:
+        tasks: Jacobians [B, K, J].
+        wanted: what each of them times the steps is to be [B, K].
+        rest: the steps that are preferred, [B, J].
+        free: joints [B, J] that may move.
+    """
+    step = torch.zeros_like(rest)
+    null = torch.diag_embed(free.to(rest))
+    for task, goal in zip(tasks, wanted, strict=True):
+        within = task @ null
+        inverse = _inverse(within)
+        step = step + (null @ inverse @ (goal - (task @ step[..., None]).squeeze(-1))[..., None]).squeeze(-1)
+        null = null - null @ inverse @ within
+    return step + (null @ rest[..., None]).squeeze(-1)
+
+
+def _inverse(matrices: Tensor) -> Tensor:
+    """Damped pseudo-inverses [B, J, K] of matrices [B, K, J]."""
+    square = (matrices @ matrices.mT).numpy() + SOFT * np.eye(matrices.shape[-2])
+    return matrices.mT @ torch.from_numpy(np.linalg.inv(square))
 
 
 def _damped(jacobian: Tensor, twist: Tensor) -> Tensor:
