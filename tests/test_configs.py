@@ -554,7 +554,7 @@ def variants(command: str) -> list[list[str]]:
         words = [PLACEHOLDERS.get(word, word).replace(",...", "") for word in words]
         choices = [re.split(r"[|]", word.partition("=")[2] or word) for word in words]
         if "-m" in words:
-            choices = [one if "[" in one[0] else one[0].split(",") for one in choices]
+            choices = [re.split(r",(?![^\[]*\])", one[0]) for one in choices]  # not within a list
         for i in range(max(map(len, choices))):
             names = [word.partition("=")[0] + "=" if "=" in word else "" for word in words]
             made.add(tuple(name + one[i % len(one)] for name, one in zip(names, choices, strict=True)))

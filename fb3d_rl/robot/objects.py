@@ -5,12 +5,12 @@ They stand in for what the authors bought: same names, categories and kinds of j
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.assets.partnet_mobility import load_object
@@ -114,13 +114,16 @@ def spec_of(listed: Listed) -> ObjectSpec:
 def make(listed: Listed, out: Path) -> ArticulatedObject:
     """Write the object as out/<label>/ in PartNet-Mobility's layout, always the same bytes, and read it.
 
-    A folder that is there already is read as it is.
+    The folder appears complete or not at all; one that is there already is read as it is.
     """
     folder = out / listed.label
     if not folder.is_dir():
         out.mkdir(parents=True, exist_ok=True)
-        folder.mkdir()
-        write_object(spec_of(listed), folder, listed.label)
+        with tempfile.TemporaryDirectory(prefix=".partial-", dir=out) as partial:
+            made = Path(partial) / listed.label
+            made.mkdir()
+            write_object(spec_of(listed), made, listed.label)
+            made.rename(folder)
     return load_object(folder)
 
 
@@ -130,9 +133,3 @@ def on_table(listed: Listed, obj: ArticulatedObject, place: tuple[float, float, 
     masses = [listed.part if i == link else listed.body if other.visuals else 0.0 for i, other in enumerate(obj.links)]
     start = opening_range(obj)[0].tolist()
     return TableObject(obj, link, start, place, masses, FRICTION[listed.joint], DAMPING[listed.joint])
-
-
-def densities(obj: ArticulatedObject, masses: tuple[float, ...]) -> list[float]:
-    """Mean density (kg/m³) of each link that has collision shapes, all of which are convex."""
-    volumes = [sum(ConvexHull(mesh.vertices).volume for mesh in link.collisions) for link in obj.links]
-    return [mass / volume for mass, volume in zip(masses, volumes, strict=True) if volume]
