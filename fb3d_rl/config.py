@@ -20,6 +20,7 @@ from fb3d_rl.evaluation.options import EvaluationOptions
 from fb3d_rl.options import built, group, keys, listing, option, schema
 from fb3d_rl.policies.options import BUDGETED, COMPARING, PolicyOptions
 from fb3d_rl.registry import REGISTRY
+from fb3d_rl.robot.options import RobotOptions
 from fb3d_rl.rollout.options import CollectorOptions
 from fb3d_rl.training.options import LoggerOptions
 
@@ -56,6 +57,7 @@ class EvaluateConfig(CommandConfig):
 
     checkpoint: str | None = option(None, "a run folder of launch/train.py, or a file of its weights")
     resume: bool = option(False, "go on from the rows in the run folder; name it with hydra.run.dir=DIR")
+    robot: RobotOptions = group(RobotOptions)
 
 
 @dataclass(frozen=True)
@@ -146,6 +148,12 @@ def validate(cfg: CommandConfig) -> None:
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
+    if isinstance(cfg, TrainConfig) and cfg.evaluation.robot:
+        raise UserError("protocol=robot is for launch/evaluate.py: train, then evaluate with checkpoint=RUN")
+    if isinstance(cfg, EvaluateConfig) and cfg.evaluation.robot:
+        cfg.robot.depth_noise()  # refuses unknown terms
+        if cfg.collector.backend == "ray":
+            raise UserError("protocol=robot runs in processes of this machine: give collector=process or direct")
     if cfg.policy.mask == "none" and not REGISTRY[acting].maskless:
         raise UserError(f"{acting} has to see which part to open: leave policy.mask=target")
     if cfg.evaluation.goal == "state" and REGISTRY[acting].opens_only:

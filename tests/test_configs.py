@@ -87,6 +87,7 @@ def groups_of(name: str) -> list[str]:
 def cases() -> list[tuple[str, str]]:
     further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
+    other |= {("train", "protocol/robot")}
     other |= {("view", f"policy/{name}") for name in further}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
     return [(name, option) for name in SCHEMAS for option in groups_of(name) if (name, option) not in skipped]
@@ -100,6 +101,20 @@ def test_the_defaults_are_valid(name: str, schema: type) -> None:
 @pytest.mark.parametrize(("name", "option"), cases())
 def test_every_option_of_every_group_is_valid(name: str, option: str) -> None:
     compose(name, option.replace("/", "="), *NEEDS.get((name, option), []))
+
+
+def test_the_robots_trials_are_evaluations() -> None:
+    cfg = compose("evaluate", "protocol=robot", "robot.without=[flying]", "robot.calibration_deg=null")
+    assert cfg.evaluation.robot and cfg.evaluation.trials is None and not cfg.robot.depth_noise().flying
+    assert not compose("evaluate").evaluation.robot
+    for command, words, says in (
+        ("train", [], "launch/evaluate.py"),
+        ("evaluate", ["robot.without=[spots]"], "robot.without=spots"),
+        ("evaluate", ["collector=ray"], "collector=process"),
+        ("evaluate", ["robot.noise=none"], "robot.noise"),
+    ):
+        with pytest.raises(UserError, match=says):
+            compose(command, "protocol=robot", *words)
 
 
 def test_no_file_is_beside_the_groups() -> None:
@@ -539,7 +554,7 @@ def variants(command: str) -> list[list[str]]:
         words = [PLACEHOLDERS.get(word, word).replace(",...", "") for word in words]
         choices = [re.split(r"[|]", word.partition("=")[2] or word) for word in words]
         if "-m" in words:
-            choices = [one if "[" in one[0] else one[0].split(",") for one in choices]
+            choices = [re.split(r",(?![^\[]*\])", one[0]) for one in choices]  # not within a list
         for i in range(max(map(len, choices))):
             names = [word.partition("=")[0] + "=" if "=" in word else "" for word in words]
             made.add(tuple(name + one[i % len(one)] for name, one in zip(names, choices, strict=True)))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.algorithm import Acting
+from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.evaluation.evaluate import evaluate
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.plugin import Plugin
@@ -54,7 +55,7 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     setup.choose_device(cfg.device)  # a missing device is an error before anything is read
     chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)
-    protocol = setup.protocol(cfg, cfg.resume)
+    protocol = None if cfg.evaluation.robot else setup.protocol(cfg, cfg.resume)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
     policies = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
     made, facts = chosen.policy(limits, speeds), setup.facts(cfg)
@@ -65,5 +66,12 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
             name += "_privileged"
             facts["privileged_inputs"] = made.truths
     policies[name] = made
+    if protocol is None:
+        from fb3d_rl.evaluation.robot import evaluate_robot  # imported late, as planning takes a while to import
+
+        require_simulator()
+        count = 1 if cfg.collector.backend == "direct" else setup.collector_options(cfg).workers
+        rows = evaluate_robot(out, policies, cfg.robot, cfg.seed, cfg.evaluation.trials, count, cfg.resume, facts)
+        return [row.as_trial() for row in rows]
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     return evaluate(out, objects, policies, protocol, facts, chosen.network)

@@ -26,6 +26,9 @@ class EvaluationOptions(ScheduleOptions):
         "takes some ten seconds",
         within="[0, inf)",
     )
+    robot: bool = option(
+        False, "trials of a robot arm in its cell, with the options below robot; conf/protocol/robot.yaml sets it"
+    )
     decision_seconds: float | None = option(
         60.0,
         "a trial whose policy takes longer for one decision ends there; null: no limit",

@@ -8,7 +8,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation import tables
+from fb3d_rl.robot.rows import FILE as ROBOT
+from fb3d_rl.robot.rows import RobotRow, read_robot
 from fb3d_rl.rollout.rows import FlowRow, TrialRow, read_flow, read_trials
 from fb3d_rl.settings import leaves
 
@@ -47,6 +49,7 @@ class Run:
     flow_all_parts: list[FlowRow]
     summary: dict[str, Any]
     clouds: dict[str, NDArray[Any]] | None
+    robot: list[RobotRow] = field(default_factory=list)
 
     @cached_property
     def settings(self) -> dict[str, str]:
@@ -99,6 +102,7 @@ def read_run(path: Path) -> Run:
         flow_all_parts=read_flow(path / "flow_rows_all_parts.csv") if has["flow_rows_all_parts.csv"] else [],
         summary=_read_summary(path / "summary.json") if has["summary.json"] else tables.summary(rows, flow),
         clouds=_read_clouds(path / "clouds.npz") if has["clouds.npz"] else None,
+        robot=read_robot(path / ROBOT) if (path / ROBOT).is_file() else [],
     )
 
 

@@ -70,6 +70,9 @@ class PlaceOptions:
         True, "whether the lip must have surface below it all around, and the cup hold as far as one sees"
     )
     margin: float = option(0.005, "by how much farther out than the lip: a hand misses by millimetres", "m", "[0, inf)")
+    slant: float = option(
+        90.0, "largest angle between flow and normal, for a cup that comes along the flow", "degrees", "[0, 90]"
+    )
     near: float = option(0.003, "how near to the plane around the point that surface must be", "m", "(0, inf)")
 
     def __post_init__(self) -> None:
@@ -270,6 +273,8 @@ def choose_place(
         rows = np.array([peak]) if start < 0 else stand_ins[start : start + _BLOCK]
         curvature, ring, normals = _surface(points, points[rows], tree, cup, options)
         good = (curvature <= options.curvature) & ((ring >= cup.ring) | (not options.rim))
+        along = np.abs((flow[rows] * normals).sum(1)) / size[rows]
+        good &= along >= math.cos(math.radians(options.slant)) - 1e-9
         for i in np.flatnonzero(good):
             normal = normals[i] * (1.0 if normals[i] @ (camera - points[rows[i]]) >= 0 else -1.0)
             place = Place(int(rows[i]), float(curvature[i]), float(ring[i]), normal, start >= 0)

@@ -73,10 +73,10 @@ class ObjectSpec:
         points = np.concatenate([piece.vertices for piece in pieces])
         return np.stack([points.min(0), points.max(0)])
 
-    def normalised(self) -> ObjectSpec:
-        """The object with its bounding box's centre at 0 and half diagonal 1 m, as PartNet's are."""
+    def normalised(self, diagonal: float = 2.0) -> ObjectSpec:
+        """The object with its bounding box's centre at 0 and this diagonal (m): PartNet's is 2."""
         low, high = self.bounds()
-        scale = 2.0 / float(np.linalg.norm(high - low))
+        scale = diagonal / float(np.linalg.norm(high - low))
         shift = -scale * (low + high) / 2
         body = tuple(piece.transformed(scale, shift) for piece in self.body)
         return replace(self, body=body, parts=tuple(part.moved(scale, shift) for part in self.parts))

@@ -12,10 +12,13 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import MISSING, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 # Why a part was not opened.
 NEVER_TOUCHED = "never touched the part"
@@ -157,11 +160,13 @@ class FlowRow:
 
 
 Row = TypeVar("Row", TrialRow, FlowRow)
+Kind = TypeVar("Kind", bound="DataclassInstance")
 
 _BOOLEANS = {"True": True, "False": False}
 
 
-def _write(path: Path, rows: Sequence[Row], kind: type[Row]) -> None:
+def write(path: Path, rows: Sequence[Kind], kind: type[Kind]) -> None:
+    """Write rows, dataclasses of one kind, as CSV, atomically."""
     text = io.StringIO(newline="")
     writer = csv.writer(text)
     writer.writerow([field.name for field in fields(kind)])
@@ -169,10 +174,15 @@ def _write(path: Path, rows: Sequence[Row], kind: type[Row]) -> None:
     write_text(path, text.getvalue())
 
 
-def _read(path: Path, kind: type[Row]) -> list[Row]:
+def read(path: Path, kind: type[Kind]) -> list[Kind]:
+    """Read rows that :func:`write` wrote; columns that have defaults may be missing.
+
+    Raises:
+        UserError: the file is missing, has other columns or a value of the wrong type.
+    """
     columns = {field.name: str(field.type) for field in fields(kind)}
     needed = [field.name for field in fields(kind) if field.default is MISSING]
-    rows: list[Row] = []
+    rows: list[Kind] = []
     try:
         with path.open(newline="", encoding="utf-8", errors="surrogateescape") as file:
             reader = csv.reader(file)
@@ -198,7 +208,7 @@ def _parse(value: str, type_: str) -> Any:
 
 def write_trials(path: Path, rows: Sequence[TrialRow]) -> None:
     """Write ``rows.csv`` atomically."""
-    _write(path, rows, TrialRow)
+    write(path, rows, TrialRow)
 
 
 def read_trials(path: Path) -> list[TrialRow]:
@@ -207,12 +217,12 @@ def read_trials(path: Path) -> list[TrialRow]:
     Raises:
         UserError: the file is missing, has other columns or a value of the wrong type.
     """
-    return _read(path, TrialRow)
+    return read(path, TrialRow)
 
 
 def write_flow(path: Path, rows: Sequence[FlowRow]) -> None:
     """Write ``flow_rows.csv`` atomically."""
-    _write(path, rows, FlowRow)
+    write(path, rows, FlowRow)
 
 
 def read_flow(path: Path) -> list[FlowRow]:
@@ -221,7 +231,7 @@ def read_flow(path: Path) -> list[FlowRow]:
     Raises:
         UserError: the file is missing, has other columns or a value of the wrong type.
     """
-    return _read(path, FlowRow)
+    return read(path, FlowRow)
 
 
 def film_name(row: TrialRow) -> str:

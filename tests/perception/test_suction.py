@@ -339,3 +339,13 @@ def test_the_threshold_is_that_of_the_table() -> None:
     for line in lines:
         there, here = ([float(x) for x in re.findall(r"[\d.]+", text)] for text in (shown[line.split(" |")[0]], line))
         np.testing.assert_allclose(there, here, atol=0.003 if here == there else 8)
+
+
+def test_a_cup_that_comes_along_the_flow_needs_a_surface_that_faces_it() -> None:
+    """A flat plate that moves 30 degrees off its normal: no place for it, though the plate itself is one."""
+    plate = shape("plane", 0.002)
+    tilted = np.tile([np.sin(np.radians(30)), 0.0, np.cos(np.radians(30))], (len(plate), 1))
+    above = np.array([0.0, 0.0, 1.0])
+    assert choose_place(plate, tilted, above) is not None
+    assert choose_place(plate, tilted, above, options=PlaceOptions(slant=25.0)) is None
+    assert choose_place(plate, tilted, above, options=PlaceOptions(slant=35.0)) is not None

@@ -1,0 +1,97 @@
+"""The evaluation stage of the robot's trials: run them with every policy, and write the files that hold the results."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from tensordict.nn import TensorDictModuleBase
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation.evaluate import progress_bars
+from fb3d_rl.evaluation.robot_tables import stage_table, trial_table, write_tables
+from fb3d_rl.evaluation.tables import print_tables, summary
+from fb3d_rl.files import write_text
+from fb3d_rl.robot.options import RobotOptions
+from fb3d_rl.robot.rows import FILE, RobotRow, read_robot, write_robot
+from fb3d_rl.robot.trials import blank_rows, run_trials, schedule, session_of
+from fb3d_rl.rollout.rows import write_trials
+
+
+def evaluate_robot(
+    out: Path,
+    policies: Mapping[str, TensorDictModuleBase],
+    options: RobotOptions,
+    seed: int,
+    limit: int | None,
+    workers: int,
+    resume: bool,
+    facts: Mapping[str, Any],
+) -> list[RobotRow]:
+    """Run the robot's trials with every policy.
+
+    Writes robot.csv as they come; then rows.csv, the same in the columns of other trials, summary.json, and the tables
+    of the supplement, robot_tables.md and robot_tables.csv.
+
+    Args:
+        out: the run folder.
+        policies: name -> policy.
+        options: of the trials.
+        seed: base seed.
+        limit: at most so many trials with each policy, None for all.
+        workers: processes.
+        resume: keep the rows that are there.
+        facts: entries for summary.json.
+
+    Returns:
+        One row for each trial and policy.
+
+    Raises:
+        UserError: the rows to resume from are of other trials or policies.
+    """
+    session, trials = session_of(options, seed), schedule(options, seed, limit)
+    blanks = {name: blank_rows(name, policy, trials, session, options) for name, policy in policies.items()}
+    done = _rows_before(out / FILE, blanks) if resume else {}
+    with progress_bars() as bar:
+        for name, policy in policies.items():
+            left = {i: trial for i, trial in enumerate(trials) if (name, i) not in done}
+            task = bar.add_task(f"robot: {name}", total=len(trials), completed=len(trials) - len(left))
+            for row in run_trials(policy, left, blanks[name], session, options, out / "objects", workers):
+                done[name, row.trial] = row
+                write_robot(out / FILE, _ordered(done, policies))
+                bar.advance(task)
+    rows = _ordered(done, policies)
+    as_trials = [row.as_trial() for row in rows]
+    write_trials(out / "rows.csv", as_trials)
+    numbers = summary(as_trials, [], facts)
+    numbers["robot"] = {"calibration_deg": session.degrees, "calibration_mm": session.millimetres}
+    write_text(out / "summary.json", json.dumps(numbers, indent=1) + "\n")
+    if rows:
+        write_tables(out, rows)
+        print_tables([*(trial_table(rows, name) for name in policies), stage_table(rows)], Console())
+    return rows
+
+
+def _ordered(done: Mapping[tuple[str, int], RobotRow], policies: Mapping[str, Any]) -> list[RobotRow]:
+    return [done[key] for name in policies for key in sorted(key for key in done if key[0] == name)]
+
+
+def _rows_before(path: Path, blanks: Mapping[str, Sequence[RobotRow]]) -> dict[tuple[str, int], RobotRow]:
+    """The rows of an earlier run by policy and trial.
+
+    Raises:
+        UserError: one is of another trial or policy than is scheduled.
+    """
+    rows = read_robot(path) if path.is_file() else []
+    for row in rows:
+        scheduled = blanks.get(row.policy, ())
+        same = row.trial < len(scheduled) and row.key == scheduled[row.trial].key
+        if not same or row.policy_digest != scheduled[row.trial].policy_digest:
+            raise UserError(
+                f"{path} holds trial {row.trial}, {row.policy} with {row.object}, which is not what this evaluation "
+                "runs; evaluate in another folder: hydra.run.dir=DIR"
+            )
+    return {(row.policy, row.trial): row for row in rows}
