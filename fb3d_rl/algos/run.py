@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.algorithm import Acting
 from fb3d_rl.evaluation.evaluate import evaluate
+from fb3d_rl.evaluation.options import PROTOCOLS
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.plugin import Plugin
 from fb3d_rl.registry import REGISTRY, behind
@@ -51,6 +52,9 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     Returns:
         One row for each scheduled trial and policy.
     """
+    if own := PROTOCOLS[cfg.evaluation.protocol]:
+        rows: list[TrialRow] = behind(own)(cfg, out)
+        return rows
     setup.choose_device(cfg.device)  # a missing device is an error before anything is read
     chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)

@@ -29,6 +29,17 @@ TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """From UMPNet's axes (the camera on the -y side) to ours (on the -x side)."""
 
 
+def camera_pose() -> NDArray[np.float64]:
+    """T_world_camera [4, 4]; camera x right, y down, z forward."""
+    place, target = (TURN @ (np.array(point) - BASE) / SCALE for point in (CAMERA, (0.0, 0.0, 0.0)))
+    forward = (target - place) / np.linalg.norm(target - place)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = np.stack([right, np.cross(forward, right), forward], axis=1), place
+    return pose
+
+
 class UmpnetCamera(RaycastCamera):
     """640 x 480 pixels, 69.4 degrees wide, at (0, -2, 2) and looking at the origin of UMPNet's world, without noise.
 
@@ -38,15 +49,9 @@ class UmpnetCamera(RaycastCamera):
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """See the base class."""
-        place, target = (TURN @ (np.array(point) - BASE) / SCALE for point in (CAMERA, (0.0, 0.0, 0.0)))
-        turn = self.turn(view).T
-        forward = (target - place) / np.linalg.norm(target - place)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3, :3] = turn @ np.stack([right, np.cross(forward, right), forward], axis=1)
-        pose[:3, 3] = turn @ place
-        return pose
+        turn = np.eye(4)
+        turn[:3, :3] = self.turn(view).T
+        return np.asarray(turn @ camera_pose())
 
     def turn(self, view: View) -> NDArray[np.float64]:
         """See the base class: the camera stands still, so the object is turned."""

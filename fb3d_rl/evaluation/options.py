@@ -7,11 +7,22 @@ from dataclasses import dataclass
 from fb3d_rl.options import option
 from fb3d_rl.rollout.options import ScheduleOptions
 
+PROTOCOLS: dict[str, str] = {
+    "task": "",
+    "umpnet": "fb3d_rl.algos.umpnet:run",
+}
+"""Protocols by name, as "module:function" where trials are their own: ``function(cfg, out)`` returns the rows."""
+
 
 @dataclass(frozen=True)
 class EvaluationOptions(ScheduleOptions):
     """Which trials are run and shown; conf/protocol/ sets how they start, their goal and their repetitions."""
 
+    protocol: str = option(
+        "task",
+        "whose trials: the simulated task's, or a protocol's with a world of its own, which launch/evaluate.py runs",
+        among=PROTOCOLS,
+    )
     trials: int | None = option(
         40,
         "at most this many trials, spread over the categories; null: all visible openable parts; 0: none, which needs "

@@ -233,3 +233,35 @@ def sorted_out(scenes: Sequence[Scene], objects: Iterable[str]) -> tuple[list[Sc
         )
     counts = dict(sorted(Counter(scene.category for scene in missing).items()))
     return kept, Left(counts, tuple(sorted({s.object for s in missing})), tuple(scene.name for scene in still))
+
+
+def stand_in(scene: Scene, obj: ArticulatedObject) -> Scene:
+    """The scene with another object, such as a procedural one: as far open, with the same yaw, on the ground.
+
+    The part is one that opens, by the scene's number; all others are closed. Shares of the range from closed to open
+    are those of the scene's joint from its lower limit.
+
+    Raises:
+        UserError: the object has no part that opens.
+    """
+    posed, order = Posed(obj, CAMERA), bullet_order(obj)
+    if not posed.openable:
+        raise UserError(f"object {obj.id} has no part that opens, so it can stand in none of UMPNet's scenes")
+    index = scene.selected if scene.selected is not None else min(scene.joints)
+    told = scene.joints[index]
+    joints = {}
+    chosen = posed.openable[scene.number % len(posed.openable)]
+    for link in posed.openable:
+        j = obj.movable.index(link)
+        unit = scene.scale if obj.joint_of(link).type == "prismatic" else 1.0
+        closed, opened = unit * posed.closed[j], unit * posed.opened[j]
+        shares = [(x - told.lower) / max(told.upper - told.lower, LEAST) for x in (told.goal, told.start)]
+        goal, start = (float(closed + share * (opened - closed)) if link == chosen else closed for share in shares)
+        joints[order.index(link)] = JointState(min(closed, opened), max(closed, opened), goal, start)
+    front = Rotation.from_quat(scene.orientation).apply([-1.0, 0.0, 0.0])
+    # At 90 degrees it faces the camera. Bases of their own that are turned by quarters do not count.
+    askew = (math.degrees(math.atan2(front[1], front[0])) + 45.0) % 90.0 - 45.0
+    turned = tuple(Rotation.from_euler("z", 90.0 + askew, degrees=True).as_quat().tolist())
+    selected = None if scene.selected is None else order.index(chosen)
+    height = float(posed.T_world_base[2, 3]) * scene.scale
+    return replace(scene, object=obj.id, height=height, orientation=turned, selected=selected, joints=joints)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fb3d_rl.env.umpnet.options import BACKENDS
 from fb3d_rl.env.umpnet.scenes import Placed
 
 STROKE = 0.18
@@ -50,13 +51,6 @@ class World(Protocol):
 
     def close(self) -> None:
         """Give free what the simulation holds."""
-
-
-BACKENDS: dict[str, str] = {
-    "quasistatic": "fb3d_rl.env.umpnet.quasistatic:Quasistatic",
-    "pybullet": "fb3d_rl.env.umpnet.bullet:Bullet",
-}
-"""The worlds by name, as "module:class"."""
 
 
 def make_world(backend: str, placed: Sequence[Placed]) -> World:
