@@ -43,8 +43,11 @@ SUCCESS = 0.1
 MOVED = 0.01
 """A held point that a pull has moved by less (m of the object) has not been moved."""
 
-FARTHEST = 0.1
-"""Pixels differ from the goal image by so much (m, UMPNet's world) at most: farther things count the same."""
+ACROSS = 0.5
+"""Cosine between a prediction and the last motion below which the prediction is not followed."""
+
+NEIGHBORS = 16
+"""Points around a held one that tell the surface's normal."""
 
 STEPS_AWAY = 0.15
 """In exploration a state is novel if it is farther than this (rad, or m of the object) from the novel one before it."""
@@ -71,8 +74,9 @@ class Episode:
         link: the held link, -1 before there is one.
         reached: the goal was reached by UMPNet's rule, or in exploration the end of the range.
         sense: 1 to follow the flow, which opens, -1 to go against it.
-        before: what the pull before was decided by: the held point [3], the direction [3], and by how much the picture
-            differed from the goal image; None before the first one.
+        before: the point [3] that was held before the last pull, None before the first one.
+        motion: unit direction [3] in which a pull last moved the held point, None if none has.
+        stuck: how many pulls in succession have not moved it.
     """
 
     placed: Placed
@@ -83,7 +87,9 @@ class Episode:
     link: int = -1
     reached: bool = False
     sense: float = 1.0
-    before: tuple[NDArray[np.float64], NDArray[np.float64], float] | None = None
+    before: NDArray[np.float64] | None = None
+    motion: NDArray[np.float64] | None = None
+    stuck: int = 0
 
     @property
     def joint(self) -> int:
@@ -149,13 +155,11 @@ class Seen:
         frame: the contract's "observation" and "privileged" groups, the trial's "seed" and "elapsed_steps", [].
         points: [N, 3] the cloud in the scene's world, m.
         links: [N] the link of each point, -1 on padding.
-        off: by how much the picture differs from the goal image; 0 without one.
     """
 
     frame: TensorDict
     points: NDArray[np.float32]
     links: NDArray[np.int64]
-    off: float = 0.0
 
 
 def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64] | None, options: UmpnetOptions,
@@ -171,9 +175,9 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
     pixels = np.flatnonzero(bodies >= 0)
     points = pixel_points(pose, rays, pixels, depth.ravel()[pixels])
     pixels, points = (x[points[:, 2] > GROUND / scale] for x in (pixels, points))
-    told, off = np.zeros(len(pixels), dtype=bool), 0.0
-    if episode.goal is not None:
-        told, off = _told(episode.goal, depth, pixels, rays, scale)
+    told = np.zeros(len(pixels), dtype=bool)
+    if episode.goal is not None and options.mask == "goal":
+        told = _told(episode.goal, depth, pixels, rays, scale)
     marks = 2 * bodies.ravel()[pixels] + told
     cloud, marks = sample_cloud(points, marks, count, episode.rng)
     links = marks >> 1  # -1 on padding
@@ -200,25 +204,22 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
         },
         batch_size=[],
     )  # fmt: skip
-    return Seen(frame, cloud, links, off)
+    return Seen(frame, cloud, links)
 
 
 def _told(
     goal: _Image, depth: NDArray[np.float32], pixels: NDArray[np.int64], rays: NDArray[np.float64], scale: float
-) -> tuple[NDArray[np.bool_], float]:
-    """Whether pixels [P] differ from the goal image, and by how much the picture does (pixels that are all off are 1).
+) -> NDArray[np.bool_]:
+    """Whether pixels [P] differ from the goal image: what has gone from them there, unless that is too little.
 
     Where something farther away is seen in the goal image, what is here now has to move. Where something nearer is,
     it may only be hidden there; such pixels count where there are too few others.
     """
     now, then = depth.ravel()[pixels].astype(np.float64), goal[0].ravel()[pixels].astype(np.float64)
     then[goal[1].ravel()[pixels] < 0] = np.inf
-    away = np.abs(then - now) * np.linalg.norm(rays[:, pixels], axis=0) * scale
-    differs = away**2 > DIFFERS
+    differs = ((then - now) * np.linalg.norm(rays[:, pixels], axis=0) * scale) ** 2 > DIFFERS
     gone = differs & (then > now)
-    uncovered = np.count_nonzero((goal[1] >= 0) & (depth <= 0))  # the part is to come before what is empty now
-    off = float(np.minimum(away, FARTHEST).sum() / FARTHEST) + uncovered
-    return gone if gone.sum() >= 4 * MIN_VISIBLE else differs, off
+    return gone if gone.sum() >= 4 * MIN_VISIBLE else differs
 
 
 def _true_way(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -243,7 +244,7 @@ def run_episodes(
         points: N of a cloud.
         seed: of each scene.
         expert: the flow is the truth, also at a held point that is hidden.
-        learn: whether what a pull has brought, as the goal image shows it, corrects the sense of the flow.
+        learn: whether what pulls do corrects the flow (:func:`_learned`).
 
     Raises:
         UserError: the world cannot be made, or the policy follows no flow.
@@ -305,7 +306,7 @@ def _pull(
         ways = [_at_held(one, flow, held[k]) for k, one, flow in zip(going, seen, flows, strict=True)]
         ways = [episodes[k].sense * way for k, way in zip(going, ways, strict=True)]
         if learn:
-            ways = [_learned(episodes[k], held[k], way, one.off) for k, way, one in zip(going, ways, seen, strict=True)]
+            ways = [_learned(episodes[k], held[k], way, one) for k, way, one in zip(going, ways, seen, strict=True)]
     for k, way in zip(going, ways, strict=True):
         directions[k] = way / max(float(np.linalg.norm(way)), 1e-9)
     world.pull(directions)
@@ -314,20 +315,36 @@ def _pull(
             episodes[k].moved(float(state[episodes[k].joint]))
 
 
-def _learned(episode: Episode, held: NDArray[np.float64], way: NDArray[np.float64], off: float) -> NDArray[np.float64]:
-    """The direction [3], or its opposite if the pull before says so.
+def _learned(episode: Episode, held: NDArray[np.float64], way: NDArray[np.float64], seen: Seen) -> NDArray[np.float64]:
+    """The direction [3] to pull in by a predicted ``way`` [3] and by what the pulls so far have done.
 
-    A pull that brought the picture nearer to the goal image goes on that way, and one that took it farther goes back;
-    where nothing moved the other way is tried.
+    A part that moves goes on as it did: the prediction is turned over where it says the opposite, and left where it is
+    across. One that has stopped is pulled as it moved, then back. One that has never moved is tried along the surface's
+    normal, against the prediction, and across both.
     """
-    if episode.before is not None and episode.goal is not None:
-        point, pulled, was = episode.before
-        moved = held - point
-        wanted = -pulled if np.linalg.norm(moved) < MOVED else moved if off <= was else -moved
-        if way @ wanted < 0:
-            way = -way
-    episode.before = held, way, off
-    return way
+    if episode.before is not None:
+        moved = held - episode.before
+        still = float(np.linalg.norm(moved)) < MOVED
+        episode.stuck = episode.stuck + 1 if still else 0
+        episode.motion = episode.motion if still else moved / np.linalg.norm(moved)
+    episode.before, motion = held, episode.motion
+    way = way / max(float(np.linalg.norm(way)), 1e-9)
+    if motion is None:
+        normal = _normal(seen, held)
+        across = np.cross(way, normal)
+        tries = (way, episode.sense * normal, -way, across, -across)
+        return tries[episode.stuck % len(tries)]
+    onward = float(way @ motion)
+    along = motion if abs(onward) < ACROSS else way * np.sign(onward)
+    return (along, motion, -motion)[episode.stuck % 3]
+
+
+def _normal(seen: Seen, held: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The unit normal [3] of the seen surface around a point, towards the camera."""
+    points = seen.points[seen.links >= 0].astype(np.float64)
+    near = points[np.linalg.norm(points - held, axis=1).argsort()[:NEIGHBORS]]
+    normal = np.linalg.svd(near - near.mean(0))[2][-1]
+    return np.asarray(normal * np.sign((_rays()[0][:3, 3] - held) @ normal))
 
 
 def _at_held(seen: Seen, flow: NDArray[np.float64], held: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,6 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDictBase
-from torch import Tensor
 
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.umpnet import scheduled
