@@ -9,6 +9,7 @@ from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModuleBase
@@ -65,11 +66,9 @@ class Detail:
     novelty: float = 0.0
 
     @classmethod
-    def read(cls, line: Mapping[str, object]) -> Detail:
+    def read(cls, line: Mapping[str, Any]) -> Detail:
         """The inverse of ``dataclasses.asdict`` through JSON."""
-        values = dict(line)
-        row, joint = TrialRow(**values.pop("row")), tuple(values.pop("values"))  # type: ignore[arg-type]
-        return cls(row=row, values=joint, **values)  # type: ignore[arg-type]
+        return cls(**{**line, "row": TrialRow(**line["row"]), "values": tuple(line["values"])})
 
 
 @dataclass(frozen=True)
@@ -186,7 +185,7 @@ def _one_thread() -> None:
 def run_chunk(name: str, policy: TensorDictModuleBase, setting: Setting, jobs: Sequence[Job]) -> list[Detail]:
     """Run some scenes side by side; if that crashes, each alone, so that those at fault are failures and no others."""
     flow = flow_of(policy, name)
-    common = {"policy": name, "mask": mask_of(policy), "policy_digest": policy_digest(policy)}
+    common: dict[str, Any] = {"policy": name, "mask": mask_of(policy), "policy_digest": policy_digest(policy)}
     try:
         placed = [place(scene, obj) for _, scene, obj, _ in jobs]
         expert, learn = isinstance(policy, FlowPolicy), name in setting.learn
@@ -209,7 +208,7 @@ def run_chunk(name: str, policy: TensorDictModuleBase, setting: Setting, jobs: S
     ]
 
 
-def _detail(episode: Episode, number: int, split: str, setting: Setting, common: Mapping[str, str]) -> Detail:
+def _detail(episode: Episode, number: int, split: str, setting: Setting, common: Mapping[str, Any]) -> Detail:
     placed = episode.placed
     scene, obj = placed.scene, placed.posed.obj
     explores = placed.joint < 0

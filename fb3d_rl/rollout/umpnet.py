@@ -174,7 +174,8 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
     depth, bodies = posed.camera.depth_image(poses, VIEW)
     pixels = np.flatnonzero(bodies >= 0)
     points = pixel_points(pose, rays, pixels, depth.ravel()[pixels])
-    pixels, points = (x[points[:, 2] > GROUND / scale] for x in (pixels, points))
+    above = points[:, 2] > GROUND / scale
+    pixels, points = pixels[above], points[above]
     told = np.zeros(len(pixels), dtype=bool)
     if episode.goal is not None and options.mask == "goal":
         told = _told(episode.goal, depth, pixels, rays, scale)
