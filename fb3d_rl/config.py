@@ -15,6 +15,7 @@ from fb3d_rl.assets.options import AssetsOptions
 from fb3d_rl.camera.options import DepthCameraOptions
 from fb3d_rl.data.options import DataOptions
 from fb3d_rl.env.options import EnvOptions
+from fb3d_rl.env.umpnet.options import UmpnetOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.options import EvaluationOptions
 from fb3d_rl.options import built, group, keys, listing, option, schema
@@ -58,6 +59,7 @@ class EvaluateConfig(CommandConfig):
     checkpoint: str | None = option(None, "a run folder of launch/train.py, or a file of its weights")
     resume: bool = option(False, "go on from the rows in the run folder; name it with hydra.run.dir=DIR")
     robot: RobotOptions = group(RobotOptions)
+    umpnet: UmpnetOptions = group(UmpnetOptions)
 
 
 @dataclass(frozen=True)
@@ -142,15 +144,17 @@ def validate(cfg: CommandConfig) -> None:
         _validate_training(cfg)
     if isinstance(cfg, EvaluateConfig | ServeConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
         raise UserError(f"policy={acting} needs checkpoint=PATH, a run folder of launch/train.py or its checkpoint.pt")
+    if cfg.evaluation.protocol != "task" and not isinstance(cfg, EvaluateConfig):
+        raise UserError(
+            f"protocol={cfg.evaluation.protocol} has trials of its own, which launch/evaluate.py runs alone"
+        )
     if REGISTRY[cfg.policy.name].outside != bool(cfg.policy.target):
         raise UserError("policy=plugin and policy.target=package.module:make, a policy of your own, go together")
     if isinstance(cfg, ViewConfig):
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
-    if isinstance(cfg, TrainConfig) and cfg.evaluation.robot:
-        raise UserError("protocol=robot is for launch/evaluate.py: train, then evaluate with checkpoint=RUN")
-    if isinstance(cfg, EvaluateConfig) and cfg.evaluation.robot:
+    if isinstance(cfg, EvaluateConfig) and cfg.evaluation.protocol == "robot":
         cfg.robot.depth_noise()  # refuses unknown terms
         if cfg.collector.backend == "ray":
             raise UserError("protocol=robot runs in processes of this machine: give collector=process or direct")

@@ -105,8 +105,8 @@ def test_every_option_of_every_group_is_valid(name: str, option: str) -> None:
 
 def test_the_robots_trials_are_evaluations() -> None:
     cfg = compose("evaluate", "protocol=robot", "robot.without=[flying]", "robot.calibration_deg=null")
-    assert cfg.evaluation.robot and cfg.evaluation.trials is None and not cfg.robot.depth_noise().flying
-    assert not compose("evaluate").evaluation.robot
+    assert cfg.evaluation.protocol == "robot" and cfg.evaluation.trials is None and not cfg.robot.depth_noise().flying
+    assert compose("evaluate").evaluation.protocol == "task"
     for command, words, says in (
         ("train", [], "launch/evaluate.py"),
         ("evaluate", ["robot.without=[spots]"], "robot.without=spots"),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.algorithm import Acting
-from fb3d_rl.env.torchrl_env import require_simulator
 from fb3d_rl.evaluation.evaluate import evaluate
+from fb3d_rl.evaluation.options import PROTOCOLS
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.plugin import Plugin
 from fb3d_rl.registry import REGISTRY, behind
@@ -52,12 +55,33 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     Returns:
         One row for each scheduled trial and policy.
     """
+    if own := PROTOCOLS[cfg.evaluation.protocol]:
+        rows: list[TrialRow] = behind(own)(cfg, out)
+        return rows
     setup.choose_device(cfg.device)  # a missing device is an error before anything is read
+    cfg, policies, facts, network = policies_of(cfg)
+    protocol = setup.protocol(cfg, cfg.resume)
+    objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
+    return evaluate(out, objects, policies, protocol, facts, network)
+
+
+class Compared(NamedTuple):
+    """Policies that are evaluated on the same trials, by name, with the settled configuration and facts about both."""
+
+    cfg: EvaluateConfig
+    policies: dict[str, TensorDictModuleBase]
+    facts: dict[str, Any]
+    network: nn.Module | None
+
+
+def policies_of(cfg: EvaluateConfig) -> Compared:
+    """The configured policy, and the expert if evaluation.expert says so."""
     chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
     cfg = setup.settled(cfg, chosen.part_mask_input)
-    protocol = None if cfg.evaluation.robot else setup.protocol(cfg, cfg.resume)
     limits, speeds = setup.velocity_limits(cfg), setup.flow_policy_options(cfg)
-    policies = {"expert": expert_policy(limits, speeds)} if cfg.evaluation.expert else {}
+    policies: dict[str, TensorDictModuleBase] = {}
+    if cfg.evaluation.expert:
+        policies["expert"] = expert_policy(limits, speeds)
     made, facts = chosen.policy(limits, speeds), setup.facts(cfg)
     name = chosen.name
     if isinstance(made, Plugin):
@@ -66,12 +90,4 @@ def run_evaluation(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
             name += "_privileged"
             facts["privileged_inputs"] = made.truths
     policies[name] = made
-    if protocol is None:
-        from fb3d_rl.evaluation.robot import evaluate_robot  # imported late, as planning takes a while to import
-
-        require_simulator()
-        count = 1 if cfg.collector.backend == "direct" else setup.collector_options(cfg).workers
-        rows = evaluate_robot(out, policies, cfg.robot, cfg.seed, cfg.evaluation.trials, count, cfg.resume, facts)
-        return [row.as_trial() for row in rows]
-    objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
-    return evaluate(out, objects, policies, protocol, facts, chosen.network)
+    return Compared(cfg, policies, facts, chosen.network)

@@ -142,8 +142,9 @@ def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
 
 
 def sample_options(cfg: CommandConfig) -> SampleOptions:
-    """How flow samples are drawn: always ray-cast, also where the task renders with SAPIEN."""
-    optics = CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin)
+    """How flow samples are drawn: ray-cast where the task renders with SAPIEN."""
+    kind = "raycast" if cfg.camera.kind == "sapien" else cfg.camera.kind
+    optics = CameraOptions(cfg.camera.resolution, cfg.camera.fov, cfg.camera.margin, kind)
     return replace(taken(SampleOptions, cfg.data), views=taken(ViewRange, cfg.camera), camera=optics)
 
 

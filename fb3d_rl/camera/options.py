@@ -15,6 +15,7 @@ from fb3d_rl.options import option
 SENSORS: dict[str, str] = {
     "raycast": "fb3d_rl.camera.raycast:RaycastCamera",
     "sapien": "fb3d_rl.camera.raycast:RaycastCamera",  # where no simulator runs; in the task its renderer draws
+    "umpnet": "fb3d_rl.camera.umpnet:UmpnetCamera",
 }
 """The class of each kind, as "module:object": :class:`fb3d_rl.camera.raycast.RaycastCamera`, or one derived from it."""
 
@@ -29,7 +30,8 @@ class CameraOptions:
     kind: str = option(
         "raycast",
         "the camera of the simulated task: ray casting on the CPU, or SAPIEN's renderer, which needs Vulkan. Both give "
-        "the same clouds; flow samples for training are always ray-cast",
+        "the same clouds; flow samples for training are always ray-cast. umpnet: UMPNet's camera, ray-cast, with "
+        "clouds in its frame for training (camera=umpnet sets its optics)",
         among=SENSORS,
     )
     shader: Literal["minimal", "default"] = option(

@@ -24,7 +24,7 @@ from fb3d_rl.kinematics.opening import standing_bounds
 
 _LOW = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
-_NOTHING = np.uint64(np.float32(np.inf).view(np.uint32)) << _HALF
+NOTHING = np.uint64(np.float32(np.inf).view(np.uint32)) << _HALF
 """What a pixel shows is a key: the bits of its depth (float32) above the index of its body. Depths are not negative, so
 keys sort as depths do, and of two bodies at the same depth the one with the lower index is seen, in whatever order they
 are merged. From this key on there is no hit."""
@@ -77,6 +77,10 @@ class RaycastCamera:
         """T_world_camera [4, 4] of a view; x right, y down, z forward."""
         return look_at(view, self.centre, self.distance)
 
+    def turn(self, view: View) -> NDArray[np.float64] | None:
+        """R [3, 3] that turns flow samples from the object's world to that of the camera's networks; None: the same."""
+        return None
+
     def capture(
         self, poses: NDArray[np.float64], view: View, further: bool = True
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -94,7 +98,7 @@ class RaycastCamera:
             ValueError: there is not one pose for each link and further body.
         """
         image = self._nearest(poses, view).ravel()
-        seen = np.flatnonzero((image < _NOTHING) if further else (image < _NOTHING) & ((image & _LOW) < self._links))
+        seen = np.flatnonzero((image < NOTHING) if further else (image < NOTHING) & ((image & _LOW) < self._links))
         keys = image.take(seen)
         return pixel_points(self._camera, self._rays, seen, _depth(keys)), (keys & _LOW).astype(np.int64)
 
@@ -105,7 +109,7 @@ class RaycastCamera:
             Depth [n, n] (m along the camera's axis) and the index of the body hit [n, n]; 0 and -1 where no ray hits.
         """
         image = self._nearest(poses, view)
-        hit = image < _NOTHING
+        hit = image < NOTHING
         return np.where(hit, _depth(image), np.float32(0)), np.where(hit, (image & _LOW).astype(np.int64), -1)
 
     def _nearest(self, poses: NDArray[np.float64], view: View) -> NDArray[np.uint64]:
@@ -124,7 +128,7 @@ class RaycastCamera:
             background = self._in_background if rests[self._in_background].all() else rests & links
         self._cast([index for index in np.flatnonzero(~rests).tolist() if index in self._scenes], poses)
         if background is not self._in_background:
-            self._background.fill(_NOTHING)
+            self._background.fill(NOTHING)
             self._merge(background, self._background)
         self._view, self._poses, self._in_background = view, poses, background
         image = self._background.copy()

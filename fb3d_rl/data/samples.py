@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict
 
 from fb3d_rl.data.options import SampleOptions
@@ -37,12 +38,22 @@ def draw_sample(posed: Posed, options: SampleOptions, rng: np.random.Generator) 
         qpos = np.where(rng.random(len(closed)) < options.others_closed, 0.0, rng.random(len(closed)))
         qpos[movable.index(link)] = 0.0 if rng.random() < options.closed_share else rng.random()
         poses = posed.poses(closed + qpos * (opened - closed))
-        cloud = observe(posed, poses, options.views.sample(rng), options.points, rng)
+        view = options.views.sample(rng)
+        cloud = observe(posed, poses, view, options.points, rng)
         share = rng.random()
         if cloud.shows(link):
             masked = share < 1.0 - options.unmasked_share
             targets: tuple[int, ...] = (link,) if masked and share >= options.all_parts_share else ()
             if targets and share < options.all_parts_share + options.some_parts_share:
                 targets += tuple(other for other in movable if other != link and rng.random() < 0.5)
-            return flow_sample(cloud, *targets, masked=masked)
+            return _turned(flow_sample(cloud, *targets, masked=masked), posed.camera.turn(view))
     return None
+
+
+def _turned(sample: TensorDict, turn: NDArray[np.float64] | None) -> TensorDict:
+    """A sample whose points and flow are turned by R [3, 3]."""
+    if turn is not None:
+        rotation = torch.from_numpy(turn).float()
+        for key in (("observation", "points"), ("privileged", "flow")):
+            sample[key] = sample[key] @ rotation.T
+    return sample

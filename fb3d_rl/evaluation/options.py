@@ -7,11 +7,23 @@ from dataclasses import dataclass
 from fb3d_rl.options import option
 from fb3d_rl.rollout.options import ScheduleOptions
 
+PROTOCOLS: dict[str, str] = {
+    "task": "",
+    "umpnet": "fb3d_rl.algos.umpnet:run",
+    "robot": "fb3d_rl.algos.robot:run",
+}
+"""Protocols by name, as "module:function" where trials are their own: ``function(cfg, out)`` returns the rows."""
+
 
 @dataclass(frozen=True)
 class EvaluationOptions(ScheduleOptions):
     """Which trials are run and shown; conf/protocol/ sets how they start, their goal and their repetitions."""
 
+    protocol: str = option(
+        "task",
+        "whose trials: the simulated task's, or a protocol's with a world of its own, which launch/evaluate.py runs",
+        among=PROTOCOLS,
+    )
     trials: int | None = option(
         40,
         "at most this many trials, spread over the categories; null: all visible openable parts; 0: none, which needs "
@@ -25,9 +37,6 @@ class EvaluationOptions(ScheduleOptions):
         "trials filmed with every policy, spread over the categories, half of them failures if there are any; a video "
         "takes some ten seconds",
         within="[0, inf)",
-    )
-    robot: bool = option(
-        False, "trials of a robot arm in its cell, with the options below robot; conf/protocol/robot.yaml sets it"
     )
     decision_seconds: float | None = option(
         60.0,

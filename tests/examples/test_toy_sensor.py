@@ -91,5 +91,5 @@ def test_the_task_sees_through_it(optics: CameraOptions, objects: dict[str, Arti
 
 def test_a_configuration_names_it(optics: CameraOptions, config: Callable[[str, list[str]], Any]) -> None:
     assert config("evaluate", ["camera.kind=noisy"]).camera.kind == "noisy"
-    with pytest.raises(UserError, match=r"camera\.kind=clear is unknown; choose from raycast, sapien, noisy"):
+    with pytest.raises(UserError, match=r"camera\.kind=clear is unknown; choose from raycast, sapien, umpnet, noisy"):
         config("evaluate", ["camera.kind=clear"])
