@@ -87,8 +87,8 @@ def groups_of(name: str) -> list[str]:
 def cases() -> list[tuple[str, str]]:
     further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
-    other |= {("train", "protocol/robot")}
     other |= {("view", f"policy/{name}") for name in further}
+    other |= {(name, f"protocol/{own}") for name in ("train", "view", "serve") for own in ("robot", "umpnet")}
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
     return [(name, option) for name in SCHEMAS for option in groups_of(name) if (name, option) not in skipped]
 
