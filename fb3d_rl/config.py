@@ -44,9 +44,20 @@ class CommandConfig:
 
 
 @dataclass(frozen=True)
+class ExpertOptions:
+    """The expert of env.task."""
+
+    target: str | None = option(
+        None,
+        "package.module:make, where make(env) gives a function from ManiSkill's observation to the expert's action",
+    )
+
+
+@dataclass(frozen=True)
 class TrainConfig(CommandConfig):
     """Everything that launch/train.py needs."""
 
+    expert: ExpertOptions = group(ExpertOptions)
     algo: AlgoOptions = group(AlgoOptions)
     logger: LoggerOptions = group(LoggerOptions)
     resume: bool = option(False, "go on from the run folder's checkpoint; name the folder with hydra.run.dir=DIR")
@@ -152,6 +163,7 @@ def validate(cfg: CommandConfig) -> None:
         raise UserError("policy=plugin and policy.target=package.module:make, a policy of your own, go together")
     if isinstance(cfg, ViewConfig):
         one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+    _validate_task(cfg)
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")
     if isinstance(cfg, EvaluateConfig) and cfg.evaluation.protocol == "robot":
@@ -169,6 +181,31 @@ def validate(cfg: CommandConfig) -> None:
                 f"camera.{key}={[*ends]} is no range; give two ascending angles in degrees, [lowest,highest]"
             )
     _validate_assets(cfg.assets)
+
+
+def _validate_task(cfg: CommandConfig) -> None:
+    if cfg.env.task is None and not (isinstance(cfg, TrainConfig) and cfg.expert.target):
+        return
+    if not isinstance(cfg, TrainConfig):
+        raise UserError(f"env.task={cfg.env.task} is for launch/train.py with algo=bc or algo=dagger")
+    if not (cfg.env.task and cfg.expert.target):
+        raise UserError("env.task=TASK, a task of ManiSkill, and expert.target=package.module:make go together")
+    algo = cfg.algo
+    if not isinstance(algo, ImitationOptions):
+        raise UserError(f"algo={algo.name} opens parts; on env.task={cfg.env.task} choose algo=bc or algo=dagger")
+    for key, value, wanted in (
+        ("algo.gate.name", algo.gate.name, "beta"),
+        ("algo.members", algo.members, 1),
+        ("algo.oracle", algo.oracle, False),
+        ("algo.learner.flow", algo.learner.flow, "none"),
+        ("algo.demonstrations", algo.demonstrations, None),
+        ("algo.overlap", algo.overlap, False),
+        ("algo.validate_trials", algo.validate_trials, 0),
+        ("resume", cfg.resume, False),
+    ):
+        if value != wanted:
+            said = "null" if wanted is None else str(wanted).lower()
+            raise UserError(f"{key}={value} is for opening parts; with env.task={cfg.env.task} leave {key}={said}")
 
 
 def _validate_assets(assets: AssetsOptions) -> None:

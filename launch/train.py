@@ -27,7 +27,7 @@ def task(cfg: Any, out: Path) -> None:
         raise UserError(f"algo={cfg.algo.name} is trained by one process: start it without torchrun")
     with joined(out, fresh=not cfg.resume) as shared:
         run_training(cfg, shared)
-        if rank_and_count()[0] == 0:
+        if rank_and_count()[0] == 0 and cfg.env.task is None:
             report(shared)
 
 

@@ -23,7 +23,12 @@ if TYPE_CHECKING:
 
 
 def run_training(cfg: TrainConfig, out: Path) -> list[TrialRow]:
-    """See :meth:`fb3d_rl.algos.algorithm.Algorithm.train`."""
+    """See :meth:`fb3d_rl.algos.algorithm.Algorithm.train`; a task of ManiSkill gives none of these rows."""
+    if cfg.env.task is not None:
+        from fb3d_rl.algos.task import train_on_task
+
+        train_on_task(cfg, out)
+        return []
     rows: list[TrialRow] = behind(REGISTRY[cfg.algo.name].algorithm).train(cfg, out)
     return rows
 

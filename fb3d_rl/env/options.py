@@ -87,6 +87,17 @@ class EnvOptions:
     # Parts are hollow, but their hulls are solid and overlap: at the density of wood a wide drawer would weigh 600 kg.
     density: float = option(100.0, "of the convex hulls of the object's parts; furniture is hollow", "kg/m^3")
 
+    task: str | None = option(
+        None,
+        "a task of ManiSkill in place of opening parts, such as PickCube-v1: algo=bc or dagger, with expert.target",
+    )
+    task_options: dict[str, Any] = option({}, "of env.task: arguments of gymnasium.make, such as control_mode")
+    sees: Literal["state", "points"] = option(
+        "state",
+        "of env.task, what the learner sees: the state of all that is there, or what the robot feels and a cloud of "
+        "data.points points, which needs a renderer",
+    )
+
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> EnvOptions:
         """The inverse of ``dataclasses.asdict``, also once that has been through JSON; what is left out is the default.

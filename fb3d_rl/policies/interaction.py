@@ -61,11 +61,6 @@ def uniform(tensordict: TensorDictBase, purpose: int, per_step: bool = True, cou
     return torch.from_numpy(np.stack(draws))
 
 
-def normal(uniform: Tensor) -> Tensor:
-    """Standard normal numbers from uniform ones in [0, 1), which may be 0."""
-    return torch.special.ndtri(uniform.clamp_min(1e-12))
-
-
 class BetaGate(Gate):
     """DAgger's mixture (Ross, Gordon, Bagnell 2011): the expert acts with probability beta.
 

@@ -11,11 +11,9 @@ from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS
-from fb3d_rl.models.heads import Loss, make_head
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
-from fb3d_rl.policies.interaction import normal, uniform
 from fb3d_rl.policies.options import LearnerOptions
-from fb3d_rl.policies.plans import executed, plan_state
+from fb3d_rl.policies.plans import PlanNetwork, executed, plan_state, trial_noise
 from fb3d_rl.policies.policy import Policy
 
 TWIST = 6
@@ -55,14 +53,7 @@ FLOW_KEYS: dict[str, Key | None] = {
 """Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
 
 
-LEAST_SIZE = 0.02
-"""Labels are divided by no less than this share of the gripper's limits."""
-
-NOISE = 8
-"""Purpose of random draws; see :func:`fb3d_rl.policies.interaction.uniform`."""
-
-
-class TwistNetwork(nn.Module):
+class TwistNetwork(PlanNetwork):
     """An encoder and its heads.
 
     Args:
@@ -72,51 +63,17 @@ class TwistNetwork(nn.Module):
     discrepancy [B, 1].
     """
 
-    size: Tensor
-
     def __init__(self, options: LearnerOptions) -> None:
-        super().__init__()
-        self.options = options
-        self._head = make_head(
-            options.head, options.chunk, TWIST, options.width, options.components, options.calls
-        )  # fmt: skip
+        super().__init__(options, TWIST, alike=3)  # a velocity has one size, so that it turns with the scene
         outputs = self._head.inputs + int(options.discrepancy)
         inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
         self.encoder = ENCODERS[options.encoder](inputs, HAND_FEATURES * (1 + options.history), outputs, options.width)
-        if self._head.network is not None:
-            self.head = self._head.network
-        if options.normalized:
-            self.register_buffer("size", torch.ones(TWIST))
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> tuple[Tensor, Tensor | None]:
         """See the class; None where no discrepancy is asked for."""
         raw = self.encoder(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
         distance = nn.functional.softplus(raw[:, -1:]) if self.options.discrepancy else None
         return raw[:, : self._head.inputs], distance
-
-    @property
-    def noise(self) -> int:
-        """Standard normal numbers that a plan is made from; 0: none."""
-        return self._head.noise
-
-    def plan(self, encoded: Tensor, noise: Tensor | None = None) -> Tensor:
-        """The plan [B, chunk, 6], shares of the gripper's limits; see :meth:`fb3d_rl.models.heads.Head.plan`."""
-        plan = self._head.plan(encoded, noise)
-        return plan * self.size if self.options.normalized else plan
-
-    def loss(self, kind: str, kl_weight: float) -> Loss:
-        """The loss of :meth:`fb3d_rl.models.heads.Head.loss`, for plans as :meth:`plan` gives them."""
-        loss = self._head.loss(kind, kl_weight)
-        if not self.options.normalized:
-            return loss
-        return lambda batch: loss(batch.copy().set("twist", batch["twist"] / self.size))
-
-    @torch.no_grad()
-    def normalize(self, twists: Tensor) -> None:
-        """Measure labels [R, 6]: velocities and turnings have one size each, so that it turns with the scene."""
-        if self.options.normalized:
-            size = twists.unflatten(-1, (2, 3)).square().mean((0, 2)).sqrt().clamp_min(LEAST_SIZE)
-            self.size.copy_(size.repeat_interleave(3))
 
 
 class Learner(Policy):
@@ -214,8 +171,7 @@ class Learner(Policy):
         if self._predict is not None:
             self._predict(tensordict)
         inputs, obs = self.network_inputs(tensordict), tensordict["observation"]
-        draws = uniform(tensordict, NOISE, count=self.network.noise) if self.network.noise else None
-        plan, distance = self.planned(inputs, None if draws is None else normal(draws).to(obs["points"]))
+        plan, distance = self.planned(inputs, trial_noise(tensordict, self.network.noise))
         twist, state = executed(plan, tensordict.get("learner", None), self.options)
         for key, value in state.items():
             tensordict["next", "learner", key] = value

@@ -27,9 +27,69 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
+from fb3d_rl.models.heads import Loss, make_head
+from fb3d_rl.policies.interaction import uniform
 from fb3d_rl.policies.options import LearnerOptions
+
+NOISE = 8
+"""Purpose of random draws; see :func:`fb3d_rl.policies.interaction.uniform`."""
+
+LEAST_SIZE = 0.02
+"""Labels are divided by no less than this share of the largest action."""
+
+
+class PlanNetwork(nn.Module):
+    """The head of a policy that imitates, with the size of its labels; a subclass adds what sees and calls the head.
+
+    Args:
+        options: which head.
+        size: numbers of an action, A.
+        alike: so many successive numbers of an action have one size, such as the 3 of a velocity.
+    """
+
+    size: Tensor
+
+    def __init__(self, options: LearnerOptions, size: int, alike: int = 1) -> None:
+        super().__init__()
+        self.options = options
+        self._alike = alike
+        self._head = make_head(options.head, options.chunk, size, options.width, options.components, options.calls)
+        if self._head.network is not None:
+            self.head = self._head.network
+        if options.normalized:
+            self.register_buffer("size", torch.ones(size))
+
+    @property
+    def noise(self) -> int:
+        """Standard normal numbers that a plan is made from; 0: none."""
+        return self._head.noise
+
+    def plan(self, encoded: Tensor, noise: Tensor | None = None) -> Tensor:
+        """The plan [B, chunk, A]; see :meth:`fb3d_rl.models.heads.Head.plan`."""
+        plan = self._head.plan(encoded, noise)
+        return plan * self.size if self.options.normalized else plan
+
+    def loss(self, kind: str, kl_weight: float) -> Loss:
+        """The loss of :meth:`fb3d_rl.models.heads.Head.loss`, for plans as :meth:`plan` gives them."""
+        loss = self._head.loss(kind, kl_weight)
+        if not self.options.normalized:
+            return loss
+        return lambda batch: loss(batch.copy().set("twist", batch["twist"] / self.size))
+
+    @torch.no_grad()
+    def normalize(self, labels: Tensor) -> None:
+        """Measure the size of labels [R, A], their root mean square."""
+        if self.options.normalized:
+            size = labels.unflatten(-1, (-1, self._alike)).square().mean((0, 2)).sqrt().clamp_min(LEAST_SIZE)
+            self.size.copy_(size.repeat_interleave(self._alike))
+
+
+def trial_noise(tensordict: TensorDictBase, count: int) -> Tensor | None:
+    """Standard normal numbers [E, count] that depend on the trial's seed and the step only; None for no numbers."""
+    return torch.special.ndtri(uniform(tensordict, NOISE, count=count).clamp_min(1e-12)).float() if count else None
+
 
 State = dict[str, tuple[tuple[int, ...], torch.dtype]]
 """Trailing shape and dtype of each entry."""

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pickle
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -238,6 +240,10 @@ def test_a_head_comes_back_from_its_weights_and_acts_the_same_with_the_same_seed
     assert torch.equal(act(again, td)["action"], action)
     other = act(policy, td.clone().update(episode(3, seed=1)))["action"]
     assert torch.equal(other, action) != bool(policy.network.noise), "noise follows the trial's seed"
+    sent = pickle.loads(pickle.dumps(again))  # as to a worker, which gets weights later on
+    assert torch.equal(act(sent, td)["action"], action)
+    TensorDict.from_module(Learner(policy.options, LIMITS, generator(5))).data.to_module(sent)
+    assert not torch.equal(act(sent, td)["action"], action)
     alone = act(policy, td[1:2])["action"]
     assert torch.allclose(alone, action[1:2], atol=1e-5), "and not the other scenes"
     first = Learner(policy.options, LIMITS, generator(6)).network.state_dict()
