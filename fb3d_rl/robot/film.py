@@ -60,7 +60,7 @@ class Filmed:
     def picture(self) -> Picture:
         return self.cell.picture()
 
-    def write(self, path: Path, size: tuple[int, int] = (640, 480)) -> None:
+    def write(self, path: Path, size: tuple[int, int] = (480, 360)) -> None:
         """Write the film, .mp4 or .gif."""
         encode(self._pictures(size), path, size, RATE, hold=1.0)
 
