@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -37,6 +38,10 @@ Array = NDArray[np.float64]
 
 Truth: TypeAlias = Callable[[NDArray[Any]], Array]
 """The true flow [N, 3] of points [N, 3] of the part to open, 0 on all else; of a simulated cell."""
+
+DRAWS = 4
+"""A contact is chosen by the flow that agrees best with those of other points of the same cloud: where an object can be
+taken for two kinds of things, it depends on the points which one a network finds more probable."""
 
 SMOOTHED = 16
 """Points around one that tell where the surface is."""
@@ -65,11 +70,16 @@ class Frame:
 
     @classmethod
     def of(cls, seen: Observation) -> Frame:
-        """The one in which the object that is seen faces -x and has the size that the policies know."""
+        """The one in which the side of the object that the camera sees best faces -x, and that it has the size that the
+        policies know.
+        """
         points = seen.points.astype(np.float64)
-        scene = Setting.of(points, seen.camera, "z", "auto", 0.0, seen.table, False, math.inf)
+        away = 0.5 * (points.min(0) + points.max(0)) - seen.camera
+        bearing = Rotation.from_euler("z", -math.atan2(away[1], away[0])).as_matrix()  # the camera looks along +x
+        scene = Setting.of(points @ bearing.T, bearing @ seen.camera, "z", "auto", 0.0, seen.table, False, math.inf)
         middle = 0.5 * (scene.points.min(0) + scene.points.max(0)) * (1.0, 1.0, 0.0)
-        return cls(scene.turn, scene.base + middle @ scene.turn, enlarging(scene.points))
+        turn = scene.turn @ bearing
+        return cls(turn, bearing.T @ scene.base + middle @ turn, enlarging(scene.points))
 
     def shown(self, points: NDArray[Any]) -> Tensor:
         """Points [..., 3] as the policy sees them, float32."""
@@ -108,7 +118,14 @@ class PolicyFlow:
             return self._truth(seen.points)
         if self._frame is None or not seen.holding:
             self._frame = Frame.of(seen)
-        few = thinned(seen)
+        draws = [self._flow(seen, few) for few in thinned(seen, 1 if seen.holding else DRAWS)]
+        units = [flow / max(float(np.linalg.norm(flow)), 1e-9) for flow in draws]
+        agreement = [sum(float((one * other).sum()) for other in units) for one in units]
+        return draws[int(np.argmax(agreement))]
+
+    def _flow(self, seen: Observation, few: Observation) -> Array:
+        """Flow [N, 3] of all points that are seen, in the robot's base, from what the policy says of a few."""
+        assert self._look is not None and self._frame is not None
         data = observed(few, self._frame, self._truth(few.points)).update(self._state)
         with steady_floats(), torch.no_grad():
             self._look(data)
@@ -119,9 +136,11 @@ class PolicyFlow:
         return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
 
 
-def thinned(seen: Observation) -> Observation:
-    """As many points as policies know, of the smoothed ones, which are in random order."""
-    return replace(seen, points=smoothed(seen.points)[:POINTS])
+def thinned(seen: Observation, draws: int = 1) -> list[Observation]:
+    """As many points as policies know, of the smoothed ones, which are in random order: up to so many times others."""
+    points = smoothed(seen.points)
+    starts = range(0, max(1, min(draws * POINTS, len(points) - POINTS + 1)), POINTS)
+    return [replace(seen, points=points[start : start + POINTS]) for start in starts]
 
 
 def smoothed(points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -169,7 +188,7 @@ class LearnerPull:
     def __call__(self, seen: Observation) -> Array:
         """The tip's velocity (m/s) and angular velocity (rad/s) [6] in the base."""
         frame = self._frame = self._frame or Frame.of(seen)
-        seen = thinned(seen)
+        (seen,) = thinned(seen)
         data = observed(seen, frame, self._truth(seen.points)).update(self._state)
         place = data["observation", "tool_pose"][:, :3]
         data["observation", "qpos"] = torch.cat([place, torch.zeros(1, 5)], -1)

@@ -109,7 +109,7 @@ def box(turn: float, at: tuple[float, float], holding: bool = False) -> tuple[Ob
     return seen, -rotation[:, 0]
 
 
-@pytest.mark.parametrize("turn", [-20.0, -45.0, -70.0])
+@pytest.mark.parametrize("turn", [-10.0, -20.0, -45.0, -70.0, -83.0])
 def test_an_object_is_shown_upright_in_front_of_the_policy_and_of_its_size(turn: float) -> None:
     seen, normal = box(np.radians(turn), (0.7, 0.1))
     frame = Frame.of(seen)
