@@ -2,9 +2,13 @@
 
 python launch/robot.py calibrate --out calibration.json [--samples 30] [--seed 0] [--keep DIR]
 python launch/robot.py calibrate FOLDER --out calibration.json [--marker-side .1] [--dictionary 4X4_50] [--marker-id 0]
+python launch/robot.py run [--object Microwave] [--policy pretrained] [--video FILE.mp4] [--record DIR]
+python launch/robot.py run --driver package.module:make --calibration calibration.json [--allow-motion] [--record DIR]
+python launch/robot.py run --driver recorded --session DIR
 
 calibrate finds where a fixed camera stands in the robot's base, from pictures of a marker on the flange: in a simulated
-cell, or with the pictures and poses in FOLDER (docs/robot.md describes its files).
+cell, or with the pictures and poses in FOLDER (docs/robot.md describes its files). run makes one attempt to open what
+the camera sees: in a simulated cell, on your own robot, or once more from a recording.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -49,7 +54,29 @@ def _parser() -> argparse.ArgumentParser:
     hand_eye.add_argument("--marker-side", type=float, default=0.1, help="of the black square, m (default: .1)")
     hand_eye.add_argument("--dictionary", default="4X4_50", help="OpenCV's set of ArUco markers (default: 4X4_50)")
     hand_eye.add_argument("--marker-id", type=int, default=0, help="which marker of the set (default: 0)")
+    _run_parser(commands)
     return parser
+
+
+def _run_parser(commands: Any) -> None:
+    says = "one attempt to open what the camera sees; the exit code is 1 if it failed"
+    run = commands.add_parser("run", help=says, description=says)
+    driver = "simulated, recorded, or package.module:make of your own (default: simulated)"
+    run.add_argument("--driver", default="simulated", help=driver)
+    run.add_argument("--object", default="Microwave", help="on the simulated table: a category, or an object's folder")
+    run.add_argument("--part", help="link of the object to open (default: the largest that opens)")
+    run.add_argument("--arm", default="sawyer", help="sawyer, panda, or URDF:JOINT,JOINT,...:FLANGE (default: sawyer)")
+    calibration = "of calibrate (default: the simulated cell's truth)"
+    run.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
+    policy = "weights, a run folder, pretrained, or expert: the simulated truth (default: pretrained)"
+    run.add_argument("--policy", default="pretrained", help=policy)
+    run.add_argument("--noise", default="azure_kinect", help="of the simulated camera: azure_kinect, stereo, exact")
+    run.add_argument("--suction", default="seal", help="of the simulated cup: seal, perfect (default: seal)")
+    run.add_argument("--seed", type=int, default=0)
+    run.add_argument("--session", type=Path, metavar="DIR", help="a recorded session, for --driver recorded")
+    run.add_argument("--record", type=Path, metavar="DIR", help="record the session in this new folder")
+    run.add_argument("--video", type=Path, metavar="FILE", help="film of the simulated cell, .mp4 or .gif")
+    run.add_argument("--allow-motion", action="store_true", help="let a robot that is not simulated move")
 
 
 def calibrate(options: argparse.Namespace) -> int:
@@ -91,7 +118,16 @@ def calibrate(options: argparse.Namespace) -> int:
     return int(result.grade == "poor")
 
 
-COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {"calibrate": calibrate}
+def run(options: argparse.Namespace) -> int:
+    """One attempt."""
+    from fb3d_rl.algos.weights import load_network
+    from fb3d_rl.robot.run import Settings, make_attempt
+
+    settings = Settings(**{key: value for key, value in vars(options).items() if key != "command"})
+    return make_attempt(settings, load_network, print)
+
+
+COMMANDS: dict[str, Callable[[argparse.Namespace], int | None]] = {"calibrate": calibrate, "run": run}
 
 if __name__ == "__main__":
     interrupt.run(main)

@@ -25,7 +25,9 @@ class AttemptOptions:
 
     standoff: float = option(0.1, "distance from the contact at which the planned motion ends", "m", "(0, 0.5]")
     contacts: int = option(
-        6, "contacts that are tried until the arm can come to one; the supplement tries one", within="[1, inf)"
+        6,
+        "contacts that are looked at until the arm can come to one and follow the part; the supplement has one",
+        within="[1, inf)",
     )
     apart: float = option(0.04, "distance between these", "m", "(0, inf)")
     approach_speed: float = option(0.025, "of the guarded approach", "m/s", "(0, 0.1]")

@@ -18,7 +18,7 @@ from fb3d_rl.robot.collision import Checker
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.motion import MOVED, Mover, Pull
 from fb3d_rl.robot.planning import Failure, plan
-from fb3d_rl.robot.reach import MARGIN, before_contact, obstacles_of
+from fb3d_rl.robot.reach import MARGIN, Reached, before_contact, obstacles_of
 from fb3d_rl.robot.seeing import Motion, Seen, look, motion_at, predicted, spread
 from fb3d_rl.robot.sight import ArmSight
 from fb3d_rl.robot.timing import Motion as Timed
@@ -27,11 +27,11 @@ from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
 
-_ELSEWHERE = (Reason.UNREACHABLE, Reason.GOAL_COLLISION, Reason.APPROACH_COLLISION, Reason.TIMEOUT)
-"""With these another contact may fare better."""
-
 PART = 0.2
 """A point is the part's whose flow has this share of the largest."""
+
+ENOUGH = 0.95
+"""A contact is good from which the arm can follow so much of the part's way ahead."""
 
 _PLANNING = {
     Failure.START_LIMITS: Reason.START_LIMITS,
@@ -169,27 +169,38 @@ class _Run:
         return seen
 
     def _plan(self, seen: Seen, flow: Array) -> tuple[Motion, Timed]:
-        """A contact, the part's motion there, and a way to before it; where there is none, the next best contacts."""
+        """A contact, the part's motion there, and a way to before it.
+
+        The first of the best contacts is taken from which the arm can follow the part far enough, else the one from
+        which it follows it furthest.
+        """
         dense = spread(seen.dense, seen.observation, flow)
+        found: list[tuple[Motion, Reached]] = []
         failed: Ended | None = None
         for _ in range(self.options.contacts):
             try:
                 motion = self._contact(seen, flow, dense)
                 with self._timed("planning"):
-                    way = self._way(seen, motion)
-            except Ended as end:
-                if end.reason == Reason.NO_PLACE and failed is not None:
+                    found.append((motion, self._reached(seen, motion)))
+                if found[-1][1].follows >= ENOUGH:
                     break
-                if end.reason not in _ELSEWHERE:
-                    raise
+            except Ended as end:
                 failed = failed or end
-                away = np.linalg.norm(seen.dense - motion.at, axis=1) > self.options.apart
-                dense = np.where(away[:, None], dense, 0.0)
+                if end.reason == Reason.NO_PLACE:
+                    break
+            away = np.linalg.norm(seen.dense - motion.at, axis=1) > self.options.apart
+            dense = np.where(away[:, None], dense, 0.0)
+        for motion, reached in sorted(found, key=lambda pair: -min(pair[1].follows, ENOUGH)):
+            try:
+                with self._timed("planning"):
+                    way = self._way(seen, reached)
+            except Ended as end:
+                failed = failed or end
                 continue
             self.result |= {"planned": True, "contact": motion.at}
             x, y, z = motion.at
-            turns = "turns" if np.linalg.norm(motion.turn) > 0.5 else "slides"
-            self.say(f"the part seems to {turns[:-1]}; planned {way.duration:.1f} s to ({x:.3f}, {y:.3f}, {z:.3f}) m")
+            turns = "turn" if np.linalg.norm(motion.turn) > 0.5 else "slide"
+            self.say(f"the part seems to {turns}; planned {way.duration:.1f} s to ({x:.3f}, {y:.3f}, {z:.3f}) m")
             return motion, way
         assert failed is not None
         raise failed
@@ -214,11 +225,16 @@ class _Run:
             motion = Motion(contact, dense[row] / size[row], np.zeros(3))
         return motion
 
-    def _way(self, seen: Seen, motion: Motion) -> Timed:
-        """A motion to before the contact."""
-        here, eye = self.driver.joints().position, self.camera[:3, 3]
-        reached = before_contact(self.arm, here, motion, seen.dense, eye, self.options.standoff, self.seed)
-        obstacles = obstacles_of(seen.dense, eye)
+    def _reached(self, seen: Seen, motion: Motion) -> Reached:
+        """Joint states before a contact."""
+        here = self.driver.joints().position
+        standoff = self.options.standoff
+        return before_contact(self.arm, here, motion, seen.dense, self.camera[:3, 3], standoff, self.seed)
+
+    def _way(self, seen: Seen, reached: Reached) -> Timed:
+        """A motion to one of these joint states."""
+        here = self.driver.joints().position
+        obstacles = obstacles_of(seen.dense, self.camera[:3, 3])
         found = plan(self.arm, obstacles, here, reached.poses, self.seed, margin=MARGIN, goals=reached.goals)
         if found.path is None:
             raise Ended(_PLANNING[found.failure or Failure.TIMEOUT], found.reason)

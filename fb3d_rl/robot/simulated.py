@@ -22,6 +22,7 @@ from fb3d_rl.options import check, option
 from fb3d_rl.perception.depth import Intrinsics
 from fb3d_rl.perception.suction import CupOptions
 from fb3d_rl.robot.arm import Arm
+from fb3d_rl.robot.attempt import Observation
 from fb3d_rl.robot.collision import box_distance
 from fb3d_rl.robot.cup import SimulatedCup
 from fb3d_rl.robot.driver import JointState, Picture, Wrench
@@ -246,10 +247,7 @@ class SimulatedCell:
         return -turn @ at_joint[:3], -turn @ at_joint[3:]
 
     def flow(self, points: NDArray[np.floating]) -> Array:
-        """The true flow [N, 3] of points [N, 3] (m, base) near the object's surface; the largest norm is 1.
-
-        ``lambda observation: cell.flow(observation.points)`` is the expert.
-        """
+        """The true flow [N, 3] of points [N, 3] (m, base) near the object's surface; the largest norm is 1."""
         poses = self.poses()[: len(self._links)]
         links = self._nearest_links(np.asarray(points, dtype=np.float64), poses)
         direction = self.model.direction(self.content.link)
@@ -257,6 +255,10 @@ class SimulatedCell:
             self.model.tree, torch.as_tensor(points), torch.from_numpy(links), torch.from_numpy(poses), direction
         )
         return np.asarray(normalize_flow(found).double().numpy())
+
+    def expert(self, observation: Observation) -> Array:
+        """The predictor that knows the truth."""
+        return self.flow(observation.points)
 
     def _nearest_links(self, points: Array, poses: Array) -> NDArray[np.int64]:
         """The link [N] whose surface each point is nearest to."""

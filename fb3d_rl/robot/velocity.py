@@ -35,8 +35,8 @@ HELD = 0.01
 CENTRING = 0.5
 """Joints go to the middle of their limits by this share of the way, 1/s, as far as a cup's motion leaves a choice."""
 
-SOFT = 1e-4
-"""Added to the squares of the Jacobians' singular values for a cup."""
+SOFT = (1e-4, 2e-3)
+"""Added to the squares of the Jacobians' singular values for a cup: m^2 for its place, and for its turns."""
 
 
 class Resolved(NamedTuple):
@@ -136,8 +136,15 @@ def resolve_cup(
         if not bool(beyond.any()):
             break
         found, fixed = torch.minimum(torch.maximum(found, least), most), fixed | beyond
+    # What is too fast gives up the tilt before the place.
+    left = torch.where(fixed, found, 0.0)
+    todo = [asked[0] - tasks[0] @ left]
+    bare = torch.where(fixed, left, by_priority(tasks[:1], todo, torch.zeros_like(rest), ~fixed[None])[0])
+    fastest = arm.velocity.clamp_max(speed)
+    room = (fastest - bare.abs()).clamp_min(0.0) / (found - bare).abs().clamp_min(1e-12)
+    found = bare + min(1.0, float(room.min())) * (found - bare)
     held = fixed & (torch.minimum(q - arm.lower, arm.upper - q) < HELD)
-    found = found / max(float((found.abs() / arm.velocity.clamp_max(speed)).max()), 1.0)
+    found = found / max(float((found.abs() / fastest).max()), 1.0)
     slowed = 1.0 if checker is None else _slowed(checker, q, found)
     found = slowed * found
     share = float(((tasks[0][0] @ found) @ velocity) / (velocity @ velocity).clamp_min(1e-12))
@@ -176,16 +183,11 @@ def by_priority(tasks: Sequence[Tensor], wanted: Sequence[Tensor], rest: Tensor,
     null = torch.diag_embed(free.to(rest))
     for task, goal in zip(tasks, wanted, strict=True):
         within = task @ null
-        inverse = _inverse(within)
+        square = (within @ within.mT).numpy() + SOFT[task is not tasks[0]] * np.eye(task.shape[-2])
+        inverse = within.mT @ torch.from_numpy(np.linalg.inv(square))
         step = step + (null @ inverse @ (goal - (task @ step[..., None]).squeeze(-1))[..., None]).squeeze(-1)
         null = null - null @ inverse @ within
     return step + (null @ rest[..., None]).squeeze(-1)
-
-
-def _inverse(matrices: Tensor) -> Tensor:
-    """Damped pseudo-inverses [B, J, K] of matrices [B, K, J]."""
-    square = (matrices @ matrices.mT).numpy() + SOFT * np.eye(matrices.shape[-2])
-    return matrices.mT @ torch.from_numpy(np.linalg.inv(square))
 
 
 def _damped(jacobian: Tensor, twist: Tensor) -> Tensor:

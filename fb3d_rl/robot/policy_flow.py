@@ -1,0 +1,245 @@
+"""What an attempt asks for the flow: the policies of the floating gripper, for what they see in the robot's cell.
+
+They know objects that stand at the world's origin, face -x and span about two metres. So the cloud of an attempt is
+moved, turned about the vertical and enlarged before they see it: as it is first seen, and the same way until the next
+attempt, since a part that opens would make the object look larger and turned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
+from torch import Tensor
+
+from fb3d_rl.errors import UserError
+from fb3d_rl.geometry.transforms import matrix_to_quaternion
+from fb3d_rl.models.artflownet import POINTS
+from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.interaction import InteractivePolicy, OracleGate
+from fb3d_rl.policies.learner import Learner
+from fb3d_rl.policies.policy import initial_state
+from fb3d_rl.predict.plan import enlarging
+from fb3d_rl.predict.setting import Setting
+from fb3d_rl.robot.attempt import Observation, Predictor, Puller
+from fb3d_rl.rollout.run import mask_of
+from fb3d_rl.rollout.worker import steady_floats
+
+Array = NDArray[np.float64]
+
+Truth: TypeAlias = Callable[[NDArray[Any]], Array]
+"""The true flow [N, 3] of points [N, 3] of the part to open, 0 on all else; of a simulated cell."""
+
+DRAWS = 4
+"""A contact is chosen by the flow that agrees best with those of other points of the same cloud: where an object can be
+taken for two kinds of things, it depends on the points which one a network finds more probable."""
+
+SMOOTHED = 16
+"""Points around one that tell where the surface is."""
+
+NEIGHBORS = 8
+"""A point's flow is the median of those of so many points nearest to it: single points that a camera misplaced may have
+any flow, also the largest."""
+
+FLOW = ("prediction", "flow")
+TRUE_FLOW = ("privileged", "flow")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """How an object is shown to a policy: scale * turn @ (point - base).
+
+    Attributes:
+        turn: [3, 3] about z.
+        base: [3] m, below the object's middle, at the table's height.
+        scale: by which it is enlarged.
+    """
+
+    turn: Array
+    base: Array
+    scale: float
+
+    @classmethod
+    def of(cls, seen: Observation) -> Frame:
+        """The one in which the side of the object that the camera sees best faces -x, and that it has the size that the
+        policies know.
+        """
+        points = seen.points.astype(np.float64)
+        away = 0.5 * (points.min(0) + points.max(0)) - seen.camera
+        bearing = Rotation.from_euler("z", -math.atan2(away[1], away[0])).as_matrix()  # the camera looks along +x
+        scene = Setting.of(points @ bearing.T, bearing @ seen.camera, "z", "auto", 0.0, seen.table, False, math.inf)
+        middle = 0.5 * (scene.points.min(0) + scene.points.max(0)) * (1.0, 1.0, 0.0)
+        turn = scene.turn @ bearing
+        return cls(turn, bearing.T @ scene.base + middle @ turn, enlarging(scene.points))
+
+    def shown(self, points: NDArray[Any]) -> Tensor:
+        """Points [..., 3] as the policy sees them, float32."""
+        return torch.as_tensor(self.scale * (points - self.base) @ self.turn.T, dtype=torch.float32)
+
+
+class PolicyFlow:
+    """The flow on which a policy of the floating gripper acts, as a :data:`~fb3d_rl.robot.attempt.Predictor`.
+
+    Args:
+        policy: modules that write ("prediction", "flow"), then a flow policy; or that alone, with the true flow.
+        truth: of the cell, for what the policy is given of it: the mask of the part to open, the true flow.
+
+    Raises:
+        UserError: it acts on no flow.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, truth: Truth) -> None:
+        self._truth = truth
+        self._frame: Frame | None = None
+        self._look: TensorDictModuleBase | None = None
+        if isinstance(policy, FlowPolicy) and policy.flow_key == TRUE_FLOW:
+            return
+        if isinstance(policy, TensorDictSequential):
+            self._look = TensorDictSequential(*policy.module[:-1])  # the last one moves the gripper
+        if self._look is None or FLOW not in self._look.out_keys:
+            raise UserError(
+                "the robot's trials are for policies of a flow, and for learners with algo.oracle=true: choose one"
+            )
+        self._masked = mask_of(policy) == "target"
+        self._state = initial_state(policy, torch.Size([1]))
+
+    def __call__(self, seen: Observation) -> NDArray[Any]:
+        """Flow [N, 3] in the robot's base."""
+        if self._look is None:
+            return self._truth(seen.points)
+        if self._frame is None or not seen.holding:
+            self._frame = Frame.of(seen)
+        draws = [self._flow(seen, few) for few in thinned(seen, 1 if seen.holding else DRAWS)]
+        units = [flow / max(float(np.linalg.norm(flow)), 1e-9) for flow in draws]
+        agreement = [sum(float((one * other).sum()) for other in units) for one in units]
+        return draws[int(np.argmax(agreement))]
+
+    def _flow(self, seen: Observation, few: Observation) -> Array:
+        """Flow [N, 3] of all points that are seen, in the robot's base, from what the policy says of a few."""
+        assert self._look is not None and self._frame is not None
+        data = observed(few, self._frame, self._truth(few.points)).update(self._state)
+        with steady_floats(), torch.no_grad():
+            self._look(data)
+        flow = data[FLOW][0]
+        if self._masked:
+            flow = flow * data["observation", "part_mask"][0, :, None]
+        nearby = _nearest(few.points, seen.points, NEIGHBORS)
+        return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
+
+
+def thinned(seen: Observation, draws: int = 1) -> list[Observation]:
+    """As many points as policies know, of the smoothed ones, which are in random order: up to so many times others."""
+    points = smoothed(seen.points)
+    starts = range(0, max(1, min(draws * POINTS, len(points) - POINTS + 1)), POINTS)
+    return [replace(seen, points=points[start : start + POINTS]) for start in starts]
+
+
+def smoothed(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points [N, 3] moved along the normal of the plane that fits those around each, to their median height.
+
+    Networks that were trained on exact clouds see objects much enlarged, and with them the camera's noise.
+    """
+    around = points[_nearest(points, points, SMOOTHED)].astype(np.float64)
+    apart = around - around.mean(1, keepdims=True)
+    normals = np.linalg.eigh(apart.swapaxes(1, 2) @ apart)[1][:, :, 0]
+    heights = ((around - points[:, None]) @ normals[:, :, None]).squeeze(-1)
+    return np.asarray(points + np.median(heights, axis=1)[:, None] * normals, dtype=np.float32)
+
+
+def _nearest(points: NDArray[Any], at: NDArray[Any], count: int) -> NDArray[np.int64]:
+    """Places [M, count] of the points [N, 3] nearest to others [M, 3]."""
+    found = cKDTree(points).query(at, range(1, min(count, len(points)) + 1))[1]
+    return np.asarray(found, dtype=np.int64)
+
+
+class LearnerPull:
+    """A learner that moves the held part, as a :data:`~fb3d_rl.robot.attempt.Puller`.
+
+    It gets the cloud, the mask of the part, the hand, the force and that it holds, as in its own task: with a gripper
+    whose frame is in the tip, so that joint velocities are the tip's. Of the hand's velocity the robot tells what was
+    commanded last. Its answer, a share of the gripper's limits, becomes one of the speed of a pull.
+
+    Args:
+        learner: the policy.
+        truth: of the cell, for the mask.
+        speed: of a pull, m/s.
+    """
+
+    def __init__(self, learner: Learner, truth: Truth, speed: float) -> None:
+        self._learner, self._truth, self._speed = learner, truth, speed
+        self._frame: Frame | None = None
+        self._joints = torch.zeros(1, 8)
+        self._state = initial_state(learner, torch.Size([1]))
+
+    def see(self, seen: Observation) -> NDArray[Any]:
+        """The true flow, by which the expert drives to the contact (supplement, III); it begins an attempt."""
+        self._frame = Frame.of(seen)
+        return self._truth(seen.points)
+
+    def __call__(self, seen: Observation) -> Array:
+        """The tip's velocity (m/s) and angular velocity (rad/s) [6] in the base."""
+        frame = self._frame = self._frame or Frame.of(seen)
+        (seen,) = thinned(seen)
+        data = observed(seen, frame, self._truth(seen.points)).update(self._state)
+        place = data["observation", "tool_pose"][:, :3]
+        data["observation", "qpos"] = torch.cat([place, torch.zeros(1, 5)], -1)
+        data["observation", "qvel"] = self._joints
+        with steady_floats(), torch.no_grad():
+            self._learner(data)
+        self._state = data.get("next", TensorDict({}, [1])).exclude("observation")
+        limits = self._learner.limits
+        action = data["action"]
+        self._joints = action * torch.tensor([limits.linear] * 3 + [limits.angular] * 3 + [0.0] * 2)
+        share = action[0].double().numpy()
+        turn = frame.turn.T
+        # The same path at the robot's speed: an angle for each metre of it, and the robot's metres are larger.
+        rate = limits.angular / limits.linear * frame.scale * self._speed
+        return np.concatenate([self._speed * turn @ share[:3], rate * turn @ share[3:6]])
+
+
+def asking(policy: TensorDictModuleBase, truth: Truth, speed: float) -> tuple[Predictor, Puller | None]:
+    """What an attempt asks of a policy: for the flow, and, of a learner whose contact the expert chooses, in a pull.
+
+    Raises:
+        UserError: the policy is none of a flow, and no such learner.
+    """
+    if isinstance(policy, InteractivePolicy) and isinstance(policy.gate, OracleGate):
+        if isinstance(policy.learner, Learner):
+            pull = LearnerPull(policy.learner, truth, speed)
+            return pull.see, pull
+    return PolicyFlow(policy, truth), None
+
+
+def observed(seen: Observation, frame: Frame, flow: Array) -> TensorDict:
+    """What is seen, as the contract's observation [1] in the policies' world; its true flow [N, 3] in the base.
+
+    A suction tip of the floating gripper points along +x of its tool, the robot's along +z of its tip.
+    """
+    turn = torch.from_numpy(frame.turn @ seen.tip[:3, :3] @ _TOOL)
+    tip = torch.cat([frame.shown(seen.tip[:3, 3]).double(), matrix_to_quaternion(turn)])
+    force = float(np.linalg.norm(seen.force))
+    observation = {
+        "points": frame.shown(seen.points),
+        "valid": torch.ones(len(seen.points), dtype=torch.bool),
+        "part_mask": torch.from_numpy((flow != 0).any(1)),
+        "camera_position": frame.shown(seen.camera),
+        "tool_pose": tip.float(),
+        "attached": torch.tensor([seen.holding]),
+        "contact_force": torch.tensor([force]),
+        "goal_sense": torch.ones(1),
+    }
+    content = {"observation": observation, "privileged": {"flow": torch.from_numpy(flow @ frame.turn.T).float()}}
+    return TensorDict(content, batch_size=[]).unsqueeze(0)
+
+
+_TOOL = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T
+"""R_tip_tool: the tool's x axis is the tip's z axis."""
