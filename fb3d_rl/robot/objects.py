@@ -49,7 +49,7 @@ class Stand:
 LID = Stand((0.50, 0.65), (-0.10, 0.10), (-85.0, -55.0))
 """An arm before the object cannot follow a lid to behind it: these are hinged at the robot's right."""
 
-DOOR = Stand((0.60, 0.75), (-0.20, 0.05), (-75.0, -45.0))
+DOOR = Stand((0.60, 0.75), (-0.12, 0.08), (-75.0, -45.0))
 """Hinged on its right, at the robot's side."""
 
 FRONT = Stand((0.65, 0.75), (-0.10, 0.05), (-55.0, -25.0))

@@ -25,7 +25,7 @@ from fb3d_rl.robot.attempt import Predictor
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.episode import attempt
 from fb3d_rl.robot.film import Filmed
-from fb3d_rl.robot.predictors import network_flow
+from fb3d_rl.robot.policy_flow import PolicyFlow
 from fb3d_rl.robot.recorded import Recorder, Replay, Resting
 from fb3d_rl.robot.simulated import CellOptions, SimulatedCell
 from fb3d_rl.robot.table import on_table
@@ -108,7 +108,7 @@ def make_attempt(settings: Settings, load: Callable[[str], ArtFlowNet], say: Cal
     made = _setting(settings)
     driver, opened = made.driver, made.opened
     predictor: Predictor = (
-        made.cell.expert if made.cell and made.policy == "expert" else network_flow(load(made.policy))
+        made.cell.expert if made.cell and made.policy == "expert" else PolicyFlow.of_network(load(made.policy))
     )
     filmed = recorder = None
     if settings.video is not None and made.cell is not None:

@@ -31,7 +31,7 @@ from fb3d_rl.robot.episode import attempt
 from fb3d_rl.robot.marker import Marker
 from fb3d_rl.robot.objects import SEED, TABLE_I, Listed, make, on_table
 from fb3d_rl.robot.options import RobotOptions
-from fb3d_rl.robot.predictors import asking
+from fb3d_rl.robot.policy_flow import asking
 from fb3d_rl.robot.rows import RobotRow
 from fb3d_rl.robot.simulated import CellOptions, SimulatedCell
 from fb3d_rl.rollout.run import mask_of
@@ -171,7 +171,7 @@ def run_trial(
         trial: it.
         session: of all trials.
         options: of them.
-        policy: what is asked for the flow (:func:`~fb3d_rl.robot.predictors.asking`).
+        policy: what is asked for the flow (:func:`~fb3d_rl.robot.policy_flow.asking`).
         blank: the trial's row, with nothing achieved.
         folder: of the objects.
     """

@@ -11,6 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from fb3d_rl.errors import UserError
@@ -24,7 +25,7 @@ from fb3d_rl.robot import trials
 from fb3d_rl.robot.attempt import Observation
 from fb3d_rl.robot.objects import TABLE_I
 from fb3d_rl.robot.options import RobotOptions
-from fb3d_rl.robot.predictors import Frame, asking, observed, policy_flow, smoothed
+from fb3d_rl.robot.policy_flow import Frame, PolicyFlow, asking, observed, smoothed
 from fb3d_rl.robot.rows import RobotRow
 from fb3d_rl.robot.trials import RobotTrial, blank_rows, key_of, run_trials, schedule, session_of
 
@@ -109,7 +110,7 @@ def box(turn: float, at: tuple[float, float], holding: bool = False) -> tuple[Ob
     return seen, -rotation[:, 0]
 
 
-@pytest.mark.parametrize("turn", [-20.0, -45.0, -70.0])
+@pytest.mark.parametrize("turn", [-10.0, -20.0, -45.0, -70.0, -83.0])
 def test_an_object_is_shown_upright_in_front_of_the_policy_and_of_its_size(turn: float) -> None:
     seen, normal = box(np.radians(turn), (0.7, 0.1))
     frame = Frame.of(seen)
@@ -151,7 +152,7 @@ def predicting(mask: str = "none") -> TensorDictSequential:
 
 def test_a_policys_flow_comes_back_in_the_robots_frame() -> None:
     seen, normal = box(-0.8, (0.7, 0.1))
-    flow = policy_flow(predicting(), lambda points: np.ones((len(points), 3)))(seen)
+    flow = PolicyFlow.of_policy(predicting(), lambda points: np.ones((len(points), 3)))(seen)
     cosine = flow @ normal / np.linalg.norm(flow, axis=1)
     assert cosine == pytest.approx(np.ones(len(flow)), abs=1e-3)
     assert np.linalg.norm(flow[0]) > np.linalg.norm(flow[-1])  # higher points move less
@@ -159,7 +160,7 @@ def test_a_policys_flow_comes_back_in_the_robots_frame() -> None:
 
 def test_while_it_holds_the_object_is_shown_as_it_was_first_seen() -> None:
     """Seen anew, the box of the second look would be turned by half a right angle and enlarged otherwise."""
-    asked = policy_flow(predicting(), lambda points: np.ones((len(points), 3)))
+    asked = PolicyFlow.of_policy(predicting(), lambda points: np.ones((len(points), 3)))
     first, normal = box(-0.3, (0.7, 0.1))
     asked(first)
     second, _ = box(-0.9, (0.7, 0.1), holding=True)
@@ -173,7 +174,7 @@ def test_a_policy_with_the_mask_moves_the_part_alone() -> None:
     seen, _ = box(-0.8, (0.7, 0.1))
     truth = np.zeros((len(seen.points), 3))
     truth[:30, 2] = 1.0
-    flow = policy_flow(predicting("target"), lambda points: truth)(seen)
+    flow = PolicyFlow.of_policy(predicting("target"), lambda points: truth)(seen)
     assert flow[:30].any(1).all() and not flow[30:].any()
 
 
@@ -198,7 +199,7 @@ def test_a_single_point_with_another_flow_is_outvoted() -> None:
     module = TensorDictModule(odd, in_keys=[("observation", "points")], out_keys=[("prediction", "flow")])
     policy = TensorDictSequential(module, FlowPolicy(("prediction", "flow"), LIMITS))
     seen, normal = box(-0.8, (0.7, 0.1))
-    flow = policy_flow(policy, lambda points: np.ones((len(points), 3)))(seen)
+    flow = PolicyFlow.of_policy(policy, lambda points: np.ones((len(points), 3)))(seen)
     assert (flow @ normal > 0).all() and np.linalg.norm(flow, axis=1).max() < 1.01
 
 
@@ -209,12 +210,11 @@ def test_a_learner_pulls_as_it_would_in_its_own_task(monkeypatch: pytest.MonkeyP
     twist = torch.tensor([[[-1.0, 0.0, 0.0, 0.0, 0.0, 0.4]]])  # to where the box's front faces, and a turn about z
     felt: list[torch.Tensor] = []
 
-    def network(points: torch.Tensor, features: torch.Tensor, valid: torch.Tensor, hand: torch.Tensor) -> torch.Tensor:
-        felt.append(hand)
-        return twist.expand(1, learner.options.chunk, 6)
+    def planned(inputs: TensorDict, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, None]:
+        felt.append(inputs["felt"])
+        return twist.expand(1, learner.options.chunk, 6), None
 
-    monkeypatch.setattr(learner, "network", torch.nn.Identity())
-    monkeypatch.setattr(learner.network, "forward", network)
+    monkeypatch.setattr(learner, "planned", planned)
     policy = InteractivePolicy(expert_policy(LIMITS), learner, OracleGate())
     truth = np.zeros((len(seen.points), 3))
     truth[:50] = normal
@@ -232,9 +232,9 @@ def test_a_learner_pulls_as_it_would_in_its_own_task(monkeypatch: pytest.MonkeyP
 def test_the_expert_is_the_truth_and_a_policy_without_flow_is_refused() -> None:
     seen, _ = box(-0.8, (0.7, 0.1))
     truth = np.random.default_rng(0).normal(size=(len(seen.points), 3))
-    assert np.array_equal(policy_flow(expert_policy(LIMITS), lambda points: truth)(seen), truth)
+    assert np.array_equal(PolicyFlow.of_policy(expert_policy(LIMITS), lambda points: truth)(seen), truth)
     with pytest.raises(UserError, match="policies of a flow"):
-        policy_flow(random_policy(LIMITS), lambda points: truth)
+        PolicyFlow.of_policy(random_policy(LIMITS), lambda points: truth)
 
 
 # -------------------------------------------------------------------------------------------------------- crashes

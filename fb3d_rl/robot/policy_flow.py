@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -37,6 +38,10 @@ Array = NDArray[np.float64]
 
 Truth: TypeAlias = Callable[[NDArray[Any]], Array]
 """The true flow [N, 3] of points [N, 3] of the part to open, 0 on all else; of a simulated cell."""
+
+DRAWS = 4
+"""A contact is chosen by the flow that agrees best with those of other points of the same cloud: where an object can be
+taken for two kinds of things, it depends on the points which one a network finds more probable."""
 
 SMOOTHED = 16
 """Points around one that tell where the surface is."""
@@ -65,43 +70,79 @@ class Frame:
 
     @classmethod
     def of(cls, seen: Observation) -> Frame:
-        """The one in which the object that is seen faces -x and has the size that the policies know."""
+        """The one in which the side of the object that the camera sees best faces -x, and that it has the size that the
+        policies know.
+        """
         points = seen.points.astype(np.float64)
-        scene = Setting.of(points, seen.camera, "z", "auto", 0.0, seen.table, False, math.inf)
+        away = 0.5 * (points.min(0) + points.max(0)) - seen.camera
+        bearing = Rotation.from_euler("z", -math.atan2(away[1], away[0])).as_matrix()  # the camera looks along +x
+        scene = Setting.of(points @ bearing.T, bearing @ seen.camera, "z", "auto", 0.0, seen.table, False, math.inf)
         middle = 0.5 * (scene.points.min(0) + scene.points.max(0)) * (1.0, 1.0, 0.0)
-        return cls(scene.turn, scene.base + middle @ scene.turn, enlarging(scene.points))
+        turn = scene.turn @ bearing
+        return cls(turn, bearing.T @ scene.base + middle @ turn, enlarging(scene.points))
 
     def shown(self, points: NDArray[Any]) -> Tensor:
         """Points [..., 3] as the policy sees them, float32."""
         return torch.as_tensor(self.scale * (points - self.base) @ self.turn.T, dtype=torch.float32)
 
 
-class ShownFlow:
-    """The flow that a module writes for an object as policies know them, as a predictor of an attempt.
+class PolicyFlow:
+    """The flow on which a policy of the floating gripper acts, as a :data:`~fb3d_rl.robot.attempt.Predictor`.
 
     Args:
-        look: reads the contract's observation and writes ("prediction", "flow").
-        state: what it reads besides, [1].
-        truth: of the cell, for the mask of the part to open; without it the mask is empty.
+        look: reads the contract's observation and writes ("prediction", "flow"); None for the true flow.
+        truth: of the cell, for what is given of it: the mask of the part to open, the true flow; nothing unless given.
         masked: whether the flow counts on the part to open only.
+        state: what ``look`` reads besides, [1].
     """
 
     def __init__(
         self,
-        look: TensorDictModuleBase,
-        state: TensorDictBase | None = None,
+        look: TensorDictModuleBase | None,
         truth: Truth = np.zeros_like,
         masked: bool = False,
+        state: TensorDictBase | None = None,
     ) -> None:
         self._look, self._truth, self._masked = look, truth, masked
         self._state = TensorDict({}, [1]) if state is None else state
         self._frame: Frame | None = None
 
+    @classmethod
+    def of_policy(cls, policy: TensorDictModuleBase, truth: Truth) -> PolicyFlow:
+        """Of modules that write ("prediction", "flow"), then a flow policy; or of that alone, with the true flow.
+
+        Raises:
+            UserError: the policy acts on no flow.
+        """
+        if isinstance(policy, FlowPolicy) and policy.flow_key == TRUE_FLOW:
+            return cls(None, truth)
+        if isinstance(policy, TensorDictSequential):
+            look = TensorDictSequential(*policy.module[:-1])  # the last one moves the gripper
+            if FLOW in look.out_keys:
+                return cls(look, truth, mask_of(policy) == "target", initial_state(policy, torch.Size([1])))
+        raise UserError(
+            "the robot's trials are for policies of a flow, and for learners with algo.oracle=true: choose one"
+        )
+
+    @classmethod
+    def of_network(cls, net: ArtFlowNet) -> PolicyFlow:
+        """Of a network that gets no mask: nobody tells a real robot which part to open."""
+        return cls(artflownet_module(net, masked=False))
+
     def __call__(self, seen: Observation) -> NDArray[Any]:
         """Flow [N, 3] in the robot's base."""
+        if self._look is None:
+            return self._truth(seen.points)
         if self._frame is None or not seen.holding:
             self._frame = Frame.of(seen)
-        few = thinned(seen)
+        draws = [self._flow(seen, few) for few in thinned(seen, 1 if seen.holding else DRAWS)]
+        units = [flow / max(float(np.linalg.norm(flow)), 1e-9) for flow in draws]
+        agreement = [sum(float((one * other).sum()) for other in units) for one in units]
+        return draws[int(np.argmax(agreement))]
+
+    def _flow(self, seen: Observation, few: Observation) -> Array:
+        """Flow [N, 3] of all points that are seen, in the robot's base, from what the policy says of a few."""
+        assert self._look is not None and self._frame is not None
         data = observed(few, self._frame, self._truth(few.points)).update(self._state)
         with steady_floats(), torch.no_grad():
             self._look(data)
@@ -112,33 +153,11 @@ class ShownFlow:
         return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
 
 
-def network_flow(net: ArtFlowNet) -> Predictor:
-    """The flow of a network that gets no mask: nobody tells a robot which part to open."""
-    return ShownFlow(artflownet_module(net, masked=False))
-
-
-def policy_flow(policy: TensorDictModuleBase, truth: Truth) -> Predictor:
-    """The flow on which a policy of the floating gripper acts.
-
-    Args:
-        policy: modules that write ("prediction", "flow"), then a flow policy; or that alone, with the true flow.
-        truth: of the cell, for what the policy is given of it: the mask of the part to open, the true flow.
-
-    Raises:
-        UserError: it acts on no flow.
-    """
-    if isinstance(policy, FlowPolicy) and policy.flow_key == TRUE_FLOW:
-        return lambda seen: truth(seen.points)
-    if isinstance(policy, TensorDictSequential):
-        look = TensorDictSequential(*policy.module[:-1])  # the last one moves the gripper
-        if FLOW in look.out_keys:
-            return ShownFlow(look, initial_state(policy, torch.Size([1])), truth, mask_of(policy) == "target")
-    raise UserError("the robot's trials are for policies of a flow, and for learners with algo.oracle=true: choose one")
-
-
-def thinned(seen: Observation) -> Observation:
-    """As many points as policies know, of the smoothed ones, which are in random order."""
-    return replace(seen, points=smoothed(seen.points)[:POINTS])
+def thinned(seen: Observation, draws: int = 1) -> list[Observation]:
+    """As many points as policies know, of the smoothed ones, which are in random order: up to so many times others."""
+    points = smoothed(seen.points)
+    starts = range(0, max(1, min(draws * POINTS, len(points) - POINTS + 1)), POINTS)
+    return [replace(seen, points=points[start : start + POINTS]) for start in starts]
 
 
 def smoothed(points: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -186,7 +205,7 @@ class LearnerPull:
     def __call__(self, seen: Observation) -> Array:
         """The tip's velocity (m/s) and angular velocity (rad/s) [6] in the base."""
         frame = self._frame = self._frame or Frame.of(seen)
-        seen = thinned(seen)
+        (seen,) = thinned(seen)
         data = observed(seen, frame, self._truth(seen.points)).update(self._state)
         place = data["observation", "tool_pose"][:, :3]
         data["observation", "qpos"] = torch.cat([place, torch.zeros(1, 5)], -1)
@@ -214,7 +233,7 @@ def asking(policy: TensorDictModuleBase, truth: Truth, speed: float) -> tuple[Pr
         if isinstance(policy.learner, Learner):
             pull = LearnerPull(policy.learner, truth, speed)
             return pull.see, pull
-    return policy_flow(policy, truth), None
+    return PolicyFlow.of_policy(policy, truth), None
 
 
 def observed(seen: Observation, frame: Frame, flow: Array) -> TensorDict:
