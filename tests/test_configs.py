@@ -88,6 +88,7 @@ def cases() -> list[tuple[str, str]]:
     further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
     other |= {("view", f"policy/{name}") for name in further}
+    other |= {(name, "protocol/umpnet") for name in ("train", "view", "serve")}  # has trials of its own
     skipped = {*other, *(("evaluate", option) for option in TRAINING_ONLY)}
     return [(name, option) for name in SCHEMAS for option in groups_of(name) if (name, option) not in skipped]
 
