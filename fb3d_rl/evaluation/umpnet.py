@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 
@@ -293,6 +294,23 @@ def _table(
             first = [row for row in of_group if row.policy == names[0]]
             n = f"{len(first)} / {len({(row.category, row.object) for row in first})}"
             yield f"| {label} | {n} | " + " | ".join(cells) + " |"
+        cells = [
+            _over_scenes([row for row in rows if row.policy == name], categories, metric, inverse) for name in names
+        ]
+        if any(cells):
+            yield f"| {kind}, categories' means over scenes | | " + " | ".join(cells) + " |"
+
+
+def _over_scenes(rows: Sequence[TrialRow], categories: Sequence[str], metric: Metric, inverse: bool) -> str:
+    """The class mean where all scenes of a category weigh the same, as UMPNet's script has it."""
+    groups = [[row for row in rows if row.category == name] for name in categories]
+    found = [
+        np.mean([row.success if metric is SUCCESS else row.normalized_distance for row in group])
+        for group in groups
+        if group
+    ]
+    mean = float(np.mean(found)) if found else None
+    return "" if mean is None else f"{1 - mean if inverse else mean:.2f}"
 
 
 def _cell(rows: Sequence[TrialRow], metric: Metric, classes: bool, inverse: bool) -> str:
