@@ -38,6 +38,13 @@ from fb3d_rl.training.run_log import read_rows
 DETAILS = "umpnet.jsonl"
 """File of the run folder with a line for each row of rows.csv: what that has no columns for."""
 
+LEGEND = (
+    "n is scenes / objects. In brackets 95 % intervals (an object is the unit). Success: normalized distance below .1 "
+    "at the end, where UMPNet's rule takes what is near the goal (.1 rad or .05 m, at most a 3.5th of the range) for "
+    "there. By our own rule the distance is what it is where the trial ended."
+)
+"""What the page says of its numbers."""
+
 PUBLISHED = {"UMPNet": (0.73, 0.75), "FlowBot3D": (0.81, 0.70)}
 """Success by class on new instances of the training categories and on test categories (supplement, Table III)."""
 
@@ -243,14 +250,9 @@ def _failure(episode: Episode, placed: Placed) -> str:
 def page(details: Sequence[Detail], setting: Setting, said: Iterable[str], command: str) -> str:
     """The tables of a run as Markdown."""
     options = setting.options
-    lines = [
-        "# In UMPNet's world", "",
-        f"`{command}`", "",
-        f"{options.task} scenes, {options.backend} backend, mask: {options.mask}. In brackets 95 % intervals (an "
-        "object is the unit), n scenes / objects. Success: normalized distance below .1 at the end, where UMPNet's "
-        "rule takes what is near the goal (.1 rad or .05 m, at most 1/3.5 of the range) for there. Own rule: not", "",
-        *(f"- {sentence}" for sentence in said),
-    ]  # fmt: skip
+    lines = ["# In UMPNet's world", "", f"`{command}`", ""]
+    lines += [f"{options.task} scenes, {options.backend} backend, mask: {options.mask}. {LEGEND}", ""]
+    lines += [f"- {sentence}" for sentence in said]
     if options.task == "exploration":
         return "\n".join([*lines, *_table(details, "Share of novel states", DISTANCE, lambda d: d.row, True)]) + "\n"
     lines += _table(details, "Table III: success", SUCCESS, lambda d: d.row)
@@ -280,7 +282,7 @@ def _table(
     """A metric by category, a column for each policy; ``inverse``: 1 minus it."""
     rows = [row_of(detail) for detail in details]
     names = policies(rows)
-    yield from ("", f"## {title}", "", "| | n | " + " | ".join(names) + " |", "| --- |" * (2 + len(names)))
+    yield from ("", f"## {title}", "", "| | n | " + " | ".join(names) + " |", "|" + " --- |" * (2 + len(names)))
     kinds = {"train categories": TRAIN_CATEGORIES, "test categories": TEST_CATEGORIES}
     for kind, categories in kinds.items():
         groups = {name: [name] for name in categories} | {f"**{kind}, class mean**": list(categories)}

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.assets.partnet_mobility import load_object
 from fb3d_rl.camera.umpnet import BASE, SCALE, TURN
 from fb3d_rl.env.umpnet.quasistatic import FRICTION, Paths, Quasistatic, balance, stroke
-from fb3d_rl.env.umpnet.scenes import Placed, place
+from fb3d_rl.env.umpnet.scenes import Mode, Placed, bullet_order, place, read_scenes, sorted_out
 from fb3d_rl.env.umpnet.world import GAIN, STILL, STROKE, make_world
 from fb3d_rl.errors import UserError
 
@@ -160,3 +162,23 @@ def test_a_circle_about_a_hinge_off_the_origin(objects: dict[str, ArticulatedObj
             moved = one.posed.poses(state)[one.link] @ np.linalg.inv(one.posed.poses(one.start)[one.link])
             np.testing.assert_allclose(world.held(0), (moved @ np.append(point, 1.0))[:3], atol=1e-9)
     assert math.isclose(float(np.linalg.det(TURN)), 1.0) and BASE[2] == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["manipulation", "exploration"])
+@pytest.mark.parametrize("backend", backends())
+def test_every_scene_of_the_table_resets_to_its_joint_states(backend: str, mode: Mode, real_root: Path) -> None:
+    kept, _ = sorted_out(read_scenes(mode), [path.name for path in real_root.iterdir()])
+    known: dict[str, ArticulatedObject] = {}
+    for scene in kept:
+        if scene.object not in known:
+            known[scene.object] = load_object(real_root / scene.object)
+        placed = place(scene, known[scene.object])
+        world = make_world(backend, [placed])
+        (state,), order = world.states, bullet_order(placed.posed.obj)
+        world.close()
+        for index, joint in scene.joints.items():
+            link = order[index]
+            unit = SCALE if placed.posed.obj.joint_of(link).type == "prismatic" else 1.0
+            wanted = joint.start if index == scene.selected else joint.goal
+            assert unit * state[placed.posed.obj.movable.index(link)] == pytest.approx(wanted, abs=1e-6), scene.name
