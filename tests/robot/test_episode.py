@@ -82,7 +82,7 @@ def test_the_guarded_approach_ends_on_the_true_surface(category: str, opened: Ca
     assert speeds.max() < 0.1  # a pull of 5 cm/s
 
 
-@pytest.mark.parametrize("category", list(PARTS))
+@pytest.mark.parametrize("category", ["KitchenPot", pytest.param("Safe", marks=pytest.mark.slow)])
 def test_a_replayed_session_gives_the_same_commands_and_result(category: str, opened: Callable[[str], tuple]) -> None:
     cell, result, folder = opened(category)
     with np.load(folder / "flows.npz") as file:
