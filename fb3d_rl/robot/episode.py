@@ -27,6 +27,9 @@ from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
 
+STOPS = 10
+"""Control steps for which an arm is told to stand still at the end."""
+
 PART = 0.2
 """A point is the part's whose flow has this share of the largest."""
 
@@ -105,7 +108,7 @@ class _Run:
             reason, sentence = Reason.DRIVER, str(error)
         finally:
             with contextlib.suppress(Exception):  # the driver may be what has failed
-                self.mover.stop(3)
+                self.mover.stop(STOPS)
             with contextlib.suppress(Exception):
                 self.driver.suction(False)
         if reason is not None and self.opened is not None and self.result.get("moved"):
