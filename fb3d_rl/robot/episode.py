@@ -27,6 +27,9 @@ from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
 
+STOPS = 10
+"""Control steps for which an arm is told to stand still at the end."""
+
 PART = 0.2
 """A point is the part's whose flow has this share of the largest."""
 
@@ -105,7 +108,7 @@ class _Run:
             reason, sentence = Reason.DRIVER, str(error)
         finally:
             with contextlib.suppress(Exception):  # the driver may be what has failed
-                self.mover.stop(3)
+                self.mover.stop(STOPS)
             with contextlib.suppress(Exception):
                 self.driver.suction(False)
         if reason is not None and self.opened is not None and self.result.get("moved"):
@@ -175,13 +178,16 @@ class _Run:
         which it follows it furthest.
         """
         dense = spread(seen.dense, seen.observation, flow)
+        size = np.linalg.norm(dense, axis=1)
+        # What does not move is none of the part: where a door lies flush in its frame, its border is a rim.
+        part = size > PART * size.max()
         found: list[tuple[Motion, Reached]] = []
         failed: Ended | None = None
         for _ in range(self.options.contacts):
             try:
-                motion = self._contact(seen, flow, dense)
+                motion = self._contact(seen, flow, dense, part)
                 with self._timed("planning"):
-                    found.append((motion, self._reached(seen, motion)))
+                    found.append((motion, self._reached(seen, motion, part)))
                 if found[-1][1].follows >= ENOUGH:
                     break
             except Ended as end:
@@ -205,31 +211,29 @@ class _Run:
         assert failed is not None
         raise failed
 
-    def _contact(self, seen: Seen, flow: Array, dense: Array) -> Motion:
+    def _contact(self, seen: Seen, flow: Array, dense: Array, part: NDArray[np.bool_]) -> Motion:
         """Where to touch, and how the part moves there."""
         with self._timed("choosing"):
-            size = np.linalg.norm(dense, axis=1)
-            # What does not move is none of the part: where a door lies flush in its frame, its border is a rim.
-            part = np.flatnonzero(size > PART * size.max())
+            rows = np.flatnonzero(part)
             place = None
-            if len(part):
-                points = seen.dense[part]
-                place = choose_place(points, dense[part], self.camera[:3, 3], self.options.cup, self.options.place)
+            if dense.any():
+                points, moves = seen.dense[rows], dense[rows]
+                place = choose_place(points, moves, self.camera[:3, 3], self.options.cup, self.options.place)
         if place is None:
             raise Ended(Reason.NO_PLACE, "nowhere on what moves is there room for the cup: all is too curved or a rim")
-        row = part[place.row]
+        row = rows[place.row]
         contact = seen.dense[row]
         self.result.setdefault("contact", contact)
         motion = motion_at(seen.observation.points, flow, contact)
         if motion is None:
-            motion = Motion(contact, dense[row] / size[row], np.zeros(3))
+            motion = Motion(contact, dense[row] / np.linalg.norm(dense[row]), np.zeros(3))
         return motion
 
-    def _reached(self, seen: Seen, motion: Motion) -> Reached:
+    def _reached(self, seen: Seen, motion: Motion, part: NDArray[np.bool_]) -> Reached:
         """Joint states before a contact."""
         here = self.driver.joints().position
         standoff = self.options.standoff
-        return before_contact(self.arm, here, motion, seen.dense, self.camera[:3, 3], standoff, self.seed)
+        return before_contact(self.arm, here, motion, seen.dense, part, self.camera[:3, 3], standoff, self.seed)
 
     def _way(self, seen: Seen, reached: Reached) -> Timed:
         """A motion to one of these joint states."""

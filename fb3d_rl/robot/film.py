@@ -20,11 +20,11 @@ from fb3d_rl.robot.workspace import CENTRE, SIZE, TABLE, cell
 
 Array = NDArray[np.float64]
 
-RATE = 10
+RATE = 6
 """Pictures per second, of the cell's time."""
 
-VIEW = View(60.0, 28.0)
-"""From the robot's right, behind it."""
+VIEW = View(-60.0, 28.0)
+"""From behind the robot on its left, where its camera is: objects face that way."""
 
 LIFT = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.05 - TABLE], [0, 0, 0, 1]])
 """The drawn ground is at 0, below the table."""
@@ -66,7 +66,8 @@ class Filmed:
 
     def _pictures(self, size: tuple[int, int]) -> Iterator[NDArray[np.uint8]]:
         obj = self.cell.content.obj
-        boxes = [box_mesh(box) for box in cell(self.cell.camera[:3, 3])]
+        # The posts on the near side would hide what happens.
+        boxes = [box_mesh(box) for box in cell() if box.size[2] < 0.5 or box.pose[1, 3] < 0.0]
         still = Body([Part(boxes, STATIC, LIFT)])
         links = [Body([Part(link.visuals, color)]) for link, color in zip(
             obj.links, link_colors(obj, self.cell.content.link), strict=True

@@ -90,7 +90,14 @@ class Reached(NamedTuple):
 
 
 def before_contact(
-    arm: Arm, here: Array, motion: Motion, cloud: Array, camera: Array, standoff: float, seed: int
+    arm: Arm,
+    here: Array,
+    motion: Motion,
+    cloud: Array,
+    part: NDArray[np.bool_],
+    camera: Array,
+    standoff: float,
+    seed: int,
 ) -> Reached:
     """Joint states from which to approach a contact.
 
@@ -99,6 +106,7 @@ def before_contact(
         here: its joint state [J] now.
         motion: of the part at the contact ``motion.at``, which the cup faces.
         cloud: of the object [P, 3], m.
+        part: which of its points [P] move with the part.
         camera: where the camera is [3], m.
         standoff: distance from the contact, m.
         seed: of the inverse kinematics.
@@ -141,8 +149,8 @@ def before_contact(
             Reason.APPROACH_COLLISION if blocked else Reason.UNREACHABLE,
             f"on the straight way to the contact the arm {what}, from all of the {len(goals)} joint states before it",
         )
-    touching = q[-1][comes]
-    share = _follows(arm, touching, arm.tip(touching), motion, Checker(arm, Obstacles(cell(camera)), MARGIN))
+    standing = Checker(arm, obstacles_of(cloud[~part], camera), MARGIN)
+    share = _follows(arm, q[-1][comes], motion, standing, thinned(cloud[part & (distance > NEAR / 2)], SPACING))
     kept = share >= CLOSE * share.max()
     return Reached(goals[comes.numpy()][kept], poses, float(share.max()))
 
@@ -157,8 +165,16 @@ def _clear(checker: Checker, q: Tensor) -> Tensor:
     return torch.from_numpy(checker.free(q.flatten(0, 1).numpy())).view(q.shape[:2])
 
 
-def _follows(arm: Arm, start: Tensor, touching: Tensor, motion: Motion, checker: Checker) -> Array:
-    """Share [G] of a part's way ahead on which the tip follows it, from joint states [G, J] at the contact."""
+def _follows(arm: Arm, start: Tensor, motion: Motion, standing: Checker, part: Array) -> Array:
+    """Share [G] of a part's way ahead on which the arm follows it and touches neither what stands nor the part.
+
+    Args:
+        arm: the arm.
+        start: joint states [G, J] at the contact.
+        motion: of the part.
+        standing: checks what does not move.
+        part: the part's cloud [P, 3] (m) now, without the surroundings of the contact.
+    """
     rate = float(np.linalg.norm(motion.turn))
     ahead = min(SLIDE, TURN / max(rate, 1e-6))
     times = torch.linspace(0.0, ahead, STRIDES + 1, dtype=torch.float64)[1:]
@@ -166,8 +182,12 @@ def _follows(arm: Arm, start: Tensor, touching: Tensor, motion: Motion, checker:
     turned, shift = screw(velocity.expand(STRIDES, 3), turn.expand(STRIDES, 3), times)
     contact = torch.as_tensor(motion.at)
     moved = rigid(turned, shift + contact - turned @ contact)
-    q, on = followed(arm, start, moved[:, None] @ touching)
-    return np.asarray((on & _clear(checker, q)).int().cumprod(0).sum(0).numpy() / STRIDES)
+    q, on = followed(arm, start, moved[:, None] @ arm.tip(start))
+    on = on & _clear(standing, q)
+    for step, pose in enumerate(moved.numpy()):
+        there = Obstacles((), part @ pose[:3, :3].T + pose[:3, 3], RADIUS)
+        on[step] &= torch.from_numpy(Checker(arm, there, MARGIN).free(q[step].numpy()))
+    return np.asarray(on.int().cumprod(0).sum(0).numpy() / STRIDES)
 
 
 def followed(arm: Arm, start: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:

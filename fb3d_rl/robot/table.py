@@ -11,7 +11,6 @@ from fb3d_rl.assets.articulation import ArticulatedObject, Joint, Link, Mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.kinematics.opening import openable_links, opening_range, standing_bounds
 from fb3d_rl.robot.simulated import TableObject
-from fb3d_rl.robot.workspace import CENTRE
 
 DIAGONAL = 0.45
 """Of a table object's bounding box, m."""
@@ -22,11 +21,15 @@ DENSITY = 100.0
 MASSES = (0.05, 5.0)
 """The smallest and the largest mass of a part, kg."""
 
-TURN = (-50.0, 0.0)
-"""How its front is turned from the robot's direction towards the camera's, degrees."""
+TURN = (-70.0, -35.0)
+"""How its front is turned from the robot's direction towards the camera's, degrees: a hand that follows a lid from the
+front over the top and down behind it meets its joints' limits, one that follows it sideways does not."""
 
-ABOUT = 0.04
-"""How far from the workspace's middle it stands in x and y, m."""
+PLACE = (0.62, 0.0)
+"""Where it stands, m."""
+
+ABOUT = 0.03
+"""How far from there at most in x and y, m."""
 
 
 def scaled(obj: ArticulatedObject, factor: float) -> ArticulatedObject:
@@ -84,7 +87,7 @@ def on_table(obj: ArticulatedObject, seed: int, part: str | None = None, diagona
     areas = [sum(trimesh.Trimesh(m.vertices, m.faces, process=False).area for m in obj.links[i].visuals) for i in links]
     link = links[int(np.argmax(areas))] if part is None else obj.index(part)
     rng = np.random.default_rng(seed)
-    x, y = np.array(CENTRE) + rng.uniform(-ABOUT, ABOUT, 2)
+    x, y = np.array(PLACE) + rng.uniform(-ABOUT, ABOUT, 2)
     turn = float(np.radians(rng.uniform(*TURN)))
     start = tuple(opening_range(small)[0].tolist())
     return TableObject(small, link, start, (float(x), float(y), turn), masses_of(small))

@@ -17,7 +17,7 @@ from fb3d_rl.procedural import generate
 from fb3d_rl.robot.arm import sawyer
 from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Ended, Reason
 from fb3d_rl.robot.driver import Driver, JointState, Picture, Wrench
-from fb3d_rl.robot.episode import attempt
+from fb3d_rl.robot.episode import STOPS, attempt
 from fb3d_rl.robot.motion import Mover
 from fb3d_rl.robot.recorded import Recorder, Replay, Resting
 from fb3d_rl.robot.seeing import Motion, denser, motion_at
@@ -150,7 +150,7 @@ def test_bad_pictures_end_an_attempt_in_one_sentence(pot: SimulatedCell) -> None
         driver = Still(pot, picture=picture)  # type: ignore[arg-type]
         result = attempt(driver, pot.arm, pot.believed, pot.expert)
         assert result.reason is reason and result.seen is seen and not result.segmented
-        assert result.sentence and "\n" not in result.sentence and driver.moves == 3  # it stops, and no more
+        assert result.sentence and "\n" not in result.sentence and driver.moves == STOPS  # it stops, and no more
 
 
 def test_bad_flows_and_places_end_an_attempt_in_one_sentence(pot: SimulatedCell) -> None:
