@@ -163,6 +163,7 @@ class SimulatedCell:
         )
         self._target = np.asarray(self._arm.qpos, dtype=np.float64)
         self._time = 0.0
+        self._command(np.zeros_like(self._target))
         self._scene.step()
 
     # ------------------------------------------------------------------------------------------------- the driver
