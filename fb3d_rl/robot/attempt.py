@@ -50,6 +50,9 @@ class AttemptOptions:
     most_force: float = option(35.0, "force that ends an attempt", "N", "(0, inf)")
     stuck_time: float = option(1.5, "a pull ends if the tip has hardly moved for so long", "s", "(0, inf)")
     pull_time: float = option(40.0, "longest pull", "s", "(0, inf)")
+    deviations: float = option(
+        2.0, "standard deviations beyond which a point of the object's cloud is an outlier; inf: none"
+    )
     points: int = option(1200, "points of the cloud that a predictor gets", within="[10, inf)")
     cup: CupOptions = field(default_factory=CupOptions)
     place: PlaceOptions = field(default_factory=PlaceOptions)

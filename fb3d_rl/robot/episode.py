@@ -164,7 +164,8 @@ class _Run:
     def _look(self, dense: bool, holding: bool = False, force: Array | None = None) -> Seen:
         try:
             with self._timed("looking"):
-                seen = look(self.driver, self.sight, self.camera, self.options.points, self.rng, holding, force, dense)
+                o, known = self.options, (self.driver, self.sight, self.camera)
+                seen = look(*known, o.points, self.rng, holding, force, dense, o.deviations)
         except Ended as end:
             self.result.setdefault("seen", end.reason == Reason.NO_OBJECT)
             raise

@@ -31,6 +31,7 @@ from fb3d_rl.policies.policy import initial_state
 from fb3d_rl.predict.plan import enlarging
 from fb3d_rl.predict.setting import Setting
 from fb3d_rl.robot.attempt import Observation, Predictor, Puller
+from fb3d_rl.robot.seeing import smoothed
 from fb3d_rl.rollout.run import mask_of
 from fb3d_rl.rollout.worker import steady_floats
 
@@ -42,9 +43,6 @@ Truth: TypeAlias = Callable[[NDArray[Any]], Array]
 DRAWS = 4
 """A contact is chosen by the flow that agrees best with those of other points of the same cloud: where an object can be
 taken for two kinds of things, it depends on the points which one a network finds more probable."""
-
-SMOOTHED = 16
-"""Points around one that tell where the surface is."""
 
 NEIGHBORS = 8
 """A point's flow is the median of those of so many points nearest to it: single points that a camera misplaced may have
@@ -158,18 +156,6 @@ def thinned(seen: Observation, draws: int = 1) -> list[Observation]:
     points = smoothed(seen.points)
     starts = range(0, max(1, min(draws * POINTS, len(points) - POINTS + 1)), POINTS)
     return [replace(seen, points=points[start : start + POINTS]) for start in starts]
-
-
-def smoothed(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Points [N, 3] moved along the normal of the plane that fits those around each, to their median height.
-
-    Networks that were trained on exact clouds see objects much enlarged, and with them the camera's noise.
-    """
-    around = points[_nearest(points, points, SMOOTHED)].astype(np.float64)
-    apart = around - around.mean(1, keepdims=True)
-    normals = np.linalg.eigh(apart.swapaxes(1, 2) @ apart)[1][:, :, 0]
-    heights = ((around - points[:, None]) @ normals[:, :, None]).squeeze(-1)
-    return np.asarray(points + np.median(heights, axis=1)[:, None] * normals, dtype=np.float32)
 
 
 def _nearest(points: NDArray[Any], at: NDArray[Any], count: int) -> NDArray[np.int64]:

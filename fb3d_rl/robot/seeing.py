@@ -41,6 +41,9 @@ MOVES = 0.3
 SUPPORT = 8
 """So many points nearby have to move."""
 
+SMOOTHED = 24
+"""Points around one that tell where the surface is."""
+
 
 class Seen(NamedTuple):
     """An object in a picture.
@@ -77,6 +80,7 @@ def look(
     holding: bool = False,
     force: Array | None = None,
     dense: bool = True,
+    deviations: float = 2.0,
 ) -> Seen:
     """Take a picture and cut the object out.
 
@@ -89,6 +93,7 @@ def look(
         holding: whether the cup holds the part.
         force: [3] N at the tip.
         dense: whether the dense cloud is wanted; else it is that of the pixels.
+        deviations: beyond which a point is an outlier (:func:`~fb3d_rl.perception.foreground.object_points`).
 
     Raises:
         Ended: there is no picture, no depth or no object.
@@ -99,7 +104,7 @@ def look(
     cloud = _in_base(points_of(depth, lens, 1.0), camera)
     cloud[~_in_workspace(cloud)] = np.nan
     table = table_plane(cloud, rng, Plane(np.array([0.0, 0.0, 1.0]), TABLE))
-    inside = object_points(cloud, table, robot.ravel())
+    inside = object_points(cloud, table, robot.ravel(), deviations=deviations)
     if inside.sum() < FEWEST:
         raise Ended(
             Reason.NO_OBJECT,
@@ -111,7 +116,7 @@ def look(
         fine = denser(np.where(inside.reshape(depth.shape), depth, 0.0))
         finer = Intrinsics(2 * lens.fx, 2 * lens.fy, 2 * lens.cx, 2 * lens.cy)
         whole = _in_base(points_of(fine, finer, 1.0), camera)
-        whole = whole[np.isfinite(whole).all(1)]
+        whole = smoothed(whole[np.isfinite(whole).all(1)]).astype(np.float64)
     chosen = rng.choice(len(own), min(points, len(own)), replace=False)
     tip = np.asarray(sight.poses(joints.position)[-1])
     felt = np.zeros(3) if force is None else force
@@ -160,6 +165,19 @@ def denser(depth: NDArray[np.floating]) -> NDArray[np.float32]:
     fine[::2, 1::2] = between(depth[:, :-1], depth[:, 1:])
     fine[1::2] = between(fine[:-2:2], fine[2::2])
     return fine
+
+
+def smoothed(points: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Points [N, 3] moved along the normal of the plane that fits those around each, to their median height.
+
+    So a place for the cup is judged by the surface and not by the camera's noise, and networks that were trained on
+    exact clouds, and see objects much enlarged, are spared it.
+    """
+    around = points[cKDTree(points).query(points, min(SMOOTHED, len(points)))[1]].astype(np.float64)
+    apart = around - around.mean(1, keepdims=True)
+    normals = np.linalg.eigh(apart.swapaxes(1, 2) @ apart)[1][:, :, 0]
+    heights = ((around - points[:, None]) @ normals[:, :, None]).squeeze(-1)
+    return np.asarray(points + np.median(heights, axis=1)[:, None] * normals, dtype=np.float32)
 
 
 def predicted(predictor: Predictor, observation: Observation) -> Array:

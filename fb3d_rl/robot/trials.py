@@ -48,9 +48,12 @@ ENOUGH = 0.02
 SEEN = 4800
 """Points of an attempt's cloud: policies see fewer, which these smooth."""
 
-SLANT = 20.0
-"""Largest angle between the flow and the surface at the contact, degrees: the cup comes along the flow and seals up to
-25, of which the errors of camera and flow take some."""
+SLANT = 25.0
+"""Largest angle between the flow and the surface's normal at the contact, degrees: a cup that comes along the flow
+seals up to there."""
+
+MARGIN = 0.008
+"""By how much farther out than the lip there has to be surface, m: by so much calibration and camera may be off."""
 
 LEARNER_LOOKS = 0.25
 """Time between two answers of a learner in a pull, s: it steers by itself, while a flow tells how to go on."""
@@ -132,8 +135,9 @@ def attempt_options(options: RobotOptions, learner: bool = False) -> AttemptOpti
     defaults = AttemptOptions()
     return replace(
         defaults,
-        place=replace(defaults.place, rim=options.rim, slant=SLANT if options.rim else 90.0),
+        place=replace(defaults.place, rim=options.rim, margin=MARGIN, slant=SLANT if options.rim else 90.0),
         points=SEEN,
+        deviations=defaults.deviations if options.outliers else np.inf,
         look_every=LEARNER_LOOKS if learner else defaults.look_every,
     )
 

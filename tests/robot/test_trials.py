@@ -25,8 +25,9 @@ from fb3d_rl.robot import trials
 from fb3d_rl.robot.attempt import Observation
 from fb3d_rl.robot.objects import TABLE_I
 from fb3d_rl.robot.options import RobotOptions
-from fb3d_rl.robot.policy_flow import Frame, PolicyFlow, asking, observed, smoothed
+from fb3d_rl.robot.policy_flow import Frame, PolicyFlow, asking, observed
 from fb3d_rl.robot.rows import RobotRow
+from fb3d_rl.robot.seeing import smoothed
 from fb3d_rl.robot.trials import RobotTrial, blank_rows, key_of, run_trials, schedule, session_of
 
 Array = NDArray[np.float64]
