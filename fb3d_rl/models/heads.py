@@ -146,7 +146,8 @@ class ChunkMixture(MixtureSameFamily):
 
     Args:
         logits: of the components [B, K].
-        loc, scale: mean and standard deviation [B, K, T, A].
+        loc: mean [B, K, T, A].
+        scale: standard deviation, likewise.
         pad: steps [B, T] bool that do not count.
     """
 
@@ -228,7 +229,8 @@ class TimedNetwork(nn.Module):
     """(actions, observation, time) along the last dimension -> as many numbers as the actions have.
 
     Args:
-        actions, observed: numbers of the actions and of the observation.
+        actions: numbers of the actions.
+        observed: numbers of the observation.
         hidden: width of the layers.
         last: the time's largest value.
     """
