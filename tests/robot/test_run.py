@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.robot.arm import sawyer
@@ -69,8 +70,9 @@ def test_a_robot_of_ones_own_is_looked_at_and_not_moved(tmp_path: Path, monkeypa
     calibration.write_text(json.dumps({"T_base_camera": np.eye(4).tolist()}))
     lines: list[str] = []
 
-    class Network:
-        pass
+    class Network(torch.nn.Module):
+        def forward(self, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+            return torch.zeros_like(points)
 
     def made(driver: str, **more: bool) -> int:
         return make_attempt(
