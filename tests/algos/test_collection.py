@@ -73,7 +73,7 @@ def collected(procedural_objects: dict[str, ArticulatedObject], monkeypatch: pyt
         workers = Fake(ends)
         rows = RowsOptions(VelocityLimits(1.0, 1.0), attached_only=attached_only)
         rng = np.random.default_rng(0)
-        round_ = collect(cast(Workers, workers), [view], SAMPLES, rows, 0, labels, rng)
+        round_ = collect(cast(Workers, workers), [view], SAMPLES, rows, 0, 1.0, 0, labels, rng)
         return workers, sum(len(frames) for frames, _ in round_.episodes)
 
     return run
