@@ -41,6 +41,10 @@ MOVES = 0.3
 SUPPORT = 8
 """So many points nearby have to move."""
 
+DILATION = 8
+"""Pixels by which the arm's outline is widened: a calibration that is off by half a degree and 5 mm shifts it by 7, and
+what is left of the arm would be an object."""
+
 SMOOTHED = 24
 """Points around one that tell where the surface is."""
 
@@ -100,7 +104,7 @@ def look(
     """
     joints = driver.joints()
     depth, lens = _checked(driver.picture())
-    robot = on_robot(depth, sight.depth(joints.position, camera, lens, depth.shape))
+    robot = on_robot(depth, sight.depth(joints.position, camera, lens, depth.shape), dilation=DILATION)
     cloud = _in_base(points_of(depth, lens, 1.0), camera)
     cloud[~_in_workspace(cloud)] = np.nan
     table = table_plane(cloud, rng, Plane(np.array([0.0, 0.0, 1.0]), TABLE))
