@@ -182,10 +182,6 @@ def _three_nearest(points: Tensor, queries: Tensor, valid: Tensor) -> tuple[Tens
 
         if 3 <= points.shape[1] <= neighbors_triton.MOST_CENTRES:
             return neighbors_triton.three_nearest(points, queries, valid)
-    if points.device.type == "cpu":
-        from fb3d_rl.geometry import points_cpu
-
-        return points_cpu.three_nearest(points, queries, valid)
     return knn(points, queries, 3, valid)
 
 

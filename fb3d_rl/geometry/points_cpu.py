@@ -17,7 +17,7 @@ FEW = 4
 
 def farthest_point_sample(points: Tensor, count: int, valid: Tensor) -> Tensor:
     """As :func:`fb3d_rl.geometry.points.farthest_point_sample`, of float32 points."""
-    chosen = [_farthest(cloud, count, real) for cloud, real in zip(points.detach().numpy(), valid.numpy(), strict=True)]
+    chosen = [_farthest(cloud, count, real) for cloud, real in zip(points.numpy(), valid.numpy(), strict=True)]
     return torch.from_numpy(np.stack(chosen))
 
 
@@ -65,18 +65,3 @@ def _first(inside: NDArray[np.bool_], index: NDArray[np.int64], mask: NDArray[np
     places = np.where(mask, begins + slots, np.minimum(begins, len(found) - 1))
     np.subtract(found[places], inside.shape[1] * np.arange(len(inside))[:, None], out=index)
     index[sizes == 0] = 0
-
-
-def three_nearest(points: Tensor, queries: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`fb3d_rl.geometry.points.knn` for three neighbours; of equally near points the lower index is first."""
-    shape = (*queries.shape[:2], min(3, points.shape[1]))
-    distances, indices = torch.empty(shape, dtype=points.dtype), torch.empty(shape, dtype=torch.int64)
-    nearest, index, rows = distances.numpy(), indices.numpy(), np.arange(shape[1])
-    for b in range(shape[0]):
-        squared = squared_distances(queries[b : b + 1], points[b : b + 1])[0].numpy()
-        squared[:, ~valid[b].numpy()] = np.inf
-        for k in range(shape[2]):
-            best = squared.argmin(1)
-            nearest[b, :, k], index[b, :, k] = squared[rows, best], best
-            squared[rows, best] = np.inf
-    return distances, indices

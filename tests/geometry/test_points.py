@@ -65,22 +65,6 @@ def test_a_cpu_samples_and_groups_as_plain_pytorch_does_to_the_last_index() -> N
             assert torch.equal(answer, plain)
 
 
-def test_a_cpu_finds_the_three_nearest_that_plain_pytorch_finds() -> None:
-    generator = torch.Generator().manual_seed(6)
-    points, queries = (torch.randn(3, n, 3, generator=generator) for n in (90, 400))
-    valid = torch.rand(3, 90, generator=generator) < 0.5
-    valid[1] = True
-    for answer, plain in zip(
-        points_cpu.three_nearest(points, queries, valid), ops.knn(points, queries, 3, valid), strict=True
-    ):
-        assert torch.equal(answer, plain)
-    valid[0] = False
-    valid[0, 7] = True
-    squared, index = points_cpu.three_nearest(points, queries, valid)
-    assert (index[0, :, 0] == 7).all() and squared[0, :, 1:].isinf().all()
-    assert points_cpu.three_nearest(points[:, :2], queries, valid[:, :2])[0].shape == (3, 400, 2)
-
-
 def test_ball_query_keeps_the_first_valid_points_by_index() -> None:
     points, valid = make_clouds()
     centres = points[:, ::7]
