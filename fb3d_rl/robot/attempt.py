@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,12 @@ class AttemptOptions:
         within="[1, inf)",
     )
     apart: float = option(0.04, "distance between these", "m", "(0, inf)")
+    grips: int = option(
+        3,
+        "grips at most: after one that does not hold, or does not move the part, the arm goes back, looks again, and "
+        "tries another place or another answer of the network; the supplement has one",
+        within="[1, inf)",
+    )
     approach_speed: float = option(0.025, "of the guarded approach", "m/s", "(0, 0.1]")
     approach_limit: float = option(0.15, "way of the guarded approach after which nothing was touched", "m", "(0, 0.5]")
     touch_force: float = option(
@@ -88,6 +94,16 @@ class Observation:
 Predictor: TypeAlias = Callable[[Observation], NDArray[Any]]
 """Flow [N, 3] of an observation's points, of any scale; the largest ones are followed."""
 
+
+@runtime_checkable
+class Learns(Protocol):
+    """A predictor that may be told of its mistakes."""
+
+    def refute(self, at: Array, way: Array) -> None:
+        """A pull at a point [3] (m) along a direction [3] of norm 1 has not moved the part."""
+        ...
+
+
 Puller: TypeAlias = Callable[[Observation], Array]
 """For a policy that knows no flow: the tip's velocity (m/s) and angular velocity (rad/s) [6] while it holds."""
 
@@ -136,12 +152,13 @@ class Attempt:
         segmented: whether there was an object in it.
         planned: whether there was a flow, a place for the cup, and a free way to it.
         touched: whether the guarded approach felt the object.
-        sealed: whether the cup's vacuum held.
-        moved: whether the held point moved 2 cm or more.
+        sealed: whether the cup's vacuum held, in one of the grips.
+        moved: whether the held point moved 2 cm or more, in one of them.
         opened: whether the part was open at the end; None if nobody could tell.
         reason: what ended the attempt, None if the part is open.
         sentence: the same in words.
-        contact: the point [3] (m) that was chosen, NaN without one.
+        grips: how many times the arm went to touch.
+        contact: the point [3] (m) that was chosen last, NaN without one.
         felt: where the tip touched [3] (m), NaN if it did not.
         way: how far the held point has moved, m.
         seconds: how long each stage took by the driver's clock, s, and "planning", "predicting" and "looking" by ours.
@@ -159,6 +176,7 @@ class Attempt:
     opened: bool | None = None
     reason: Reason | None = None
     sentence: str = ""
+    grips: int = 0
     contact: Array = field(default_factory=lambda: np.full(3, np.nan))
     felt: Array = field(default_factory=lambda: np.full(3, np.nan))
     way: float = 0.0

@@ -8,12 +8,13 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.perception.suction import choose_place
 from fb3d_rl.robot.arm import Arm
-from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Ended, Predictor, Puller, Reason
+from fb3d_rl.robot.attempt import Attempt, AttemptOptions, Ended, Learns, Predictor, Puller, Reason
 from fb3d_rl.robot.collision import Checker
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.motion import MOVED, Mover, Pull
@@ -35,6 +36,9 @@ PART = 0.2
 
 ENOUGH = 0.95
 """A contact is good from which the arm can follow so much of the part's way ahead."""
+
+AGAIN = {Reason.NO_TOUCH, Reason.NO_VACUUM, Reason.LOST_HOLD, Reason.TOO_MUCH_FORCE, Reason.STUCK, Reason.JOINT_LIMITS}
+"""Ends of a grip after which another may do better."""
 
 _PLANNING = {
     Failure.START_LIMITS: Reason.START_LIMITS,
@@ -94,14 +98,16 @@ class _Run:
         self.say = say or (lambda line: None)
         self.sight, self.mover = ArmSight(arm), Mover(driver, arm, options)
         self.rng = np.random.default_rng(derived(seed, "attempt"))
-        self.result: dict[str, Any] = {}
+        self.result: dict[str, Any] = {"grips": 0}
         self.seconds: dict[str, float] = {}
+        self.bad_places: list[Array] = []
+        """Where the cup did not hold, m."""
 
     def run(self) -> Attempt:
         """Make the attempt."""
         reason, sentence = None, "the part is open"
         try:
-            self._attempt()
+            self._attempts()
         except Ended as end:
             reason, sentence = end.reason, end.sentence
         except UserError as error:
@@ -137,6 +143,35 @@ class _Run:
     def _now(self) -> float:
         return self.driver.joints().time
 
+    def _attempts(self) -> None:
+        """Grip until the part is open."""
+        home = self.driver.joints().position
+        while True:
+            try:
+                return self._attempt()
+            except Ended as end:
+                if end.reason not in AGAIN or self.result["grips"] >= self.options.grips or self._is_open():
+                    raise
+                failed = end
+            self.say(f"{failed.sentence}; the arm goes back for another grip")
+            try:
+                self._back(home)
+            except Ended:
+                raise failed from None  # why the grip ended says more
+
+    def _is_open(self) -> bool:
+        return self.opened is not None and self.opened()
+
+    def _back(self, home: Array) -> None:
+        """Let go, move off the object, and return to where the attempt began."""
+        self.mover.stop(STOPS)
+        self.driver.suction(False)
+        with self._timed("way", self._now):
+            self.mover.off(self.options.standoff)
+            seen = self._look(dense=True)
+            pose = self.arm.tip(torch.as_tensor(home))[None]
+            self.mover.along(self._way(seen, Reached(home[None], pose, 1.0)))
+
     def _attempt(self) -> None:
         seen = self._look(dense=True)
         self.say(f"saw {len(seen.dense)} points of an object")
@@ -145,20 +180,30 @@ class _Run:
         motion, way = self._plan(seen, flow)
         with self._timed("way", self._now):
             self.mover.along(way)
+        self.result["grips"] += 1
         with self._timed("approach", self._now):
-            felt = self.mover.touch(motion.velocity)
-            self.result |= {"touched": True, "felt": felt}
-            off = 1000 * float(np.linalg.norm(felt - motion.at))
-            self.say(f"touched, {off:.0f} mm from the contact that was chosen")
-            self.mover.hold()
+            try:
+                felt = self.mover.touch(motion.velocity)
+                self.result |= {"touched": True, "felt": felt}
+                off = 1000 * float(np.linalg.norm(felt - motion.at))
+                self.say(f"touched, {off:.0f} mm from the contact that was chosen")
+                self.mover.hold()
+            except Ended:
+                self.bad_places.append(motion.at)
+                raise
         self.result["sealed"] = True
         self.say("the cup holds")
         pull = Pull(self.mover, Motion(felt, motion.velocity, motion.turn), self._look_again, self.opened)
         try:
             with self._timed("pull", self._now):
                 pulled = pull.run()
+        except Ended:
+            if pull.way < MOVED and isinstance(self.predictor, Learns):
+                self.predictor.refute(felt, motion.velocity)
+            raise
         finally:
-            self.result |= {"way": pull.way, "moved": pull.way >= MOVED}
+            way_before, moved_before = self.result.get("way", 0.0), self.result.get("moved", False)
+            self.result |= {"way": max(way_before, pull.way), "moved": moved_before or pull.way >= MOVED}
         self.result["opened"] = pulled.opened
 
     def _look(self, dense: bool, holding: bool = False, force: Array | None = None) -> Seen:
@@ -182,6 +227,8 @@ class _Run:
         size = np.linalg.norm(dense, axis=1)
         # What does not move is none of the part: where a door lies flush in its frame, its border is a rim.
         part = size > PART * size.max()
+        for place in self.bad_places:
+            dense = np.where(np.linalg.norm(seen.dense - place, axis=1)[:, None] > self.options.apart, dense, 0.0)
         found: list[tuple[Motion, Reached]] = []
         failed: Ended | None = None
         for _ in range(self.options.contacts):

@@ -229,6 +229,22 @@ class Mover:
             error = pose_error(torch.as_tensor(pose), torch.as_tensor(target)).numpy()
             self.twist(state, -o.approach_speed * way + TRACKING * error[:3], TRACKING * error[3:])
 
+    def off(self, way: float) -> None:
+        """Move the tip straight back out of its cup's axis, by ``way`` (m) or as far as the arm can."""
+        self._weak_since = None
+        start, began = self.tip(self.driver.joints()), self.driver.joints().time
+        speed = self.options.pull_speed
+        while True:
+            state = self.driver.joints()
+            gone = float((start[:3, 3] - self.tip(state)[:3, 3]) @ start[:3, 2])
+            if gone >= way or state.time - began > 2.0 * way / speed:
+                break
+            try:
+                self.twist(state, -speed * start[:3, 2], np.zeros(3))
+            except Ended:
+                break
+        self.stop()
+
     def hold(self) -> None:
         """Switch the suction on and wait for the vacuum.
 

@@ -31,6 +31,7 @@ class RobotOptions:
     seal: bool = option(True, "whether the surface and the loads decide if the cup holds; false: it always holds")
     rim: bool = option(True, "whether a place for the cup must have surface all around it (beyond the supplement)")
     outliers: bool = option(True, "whether outliers are removed from the object's cloud")
+    grips: int = option(3, "grips in a trial at most; the supplement has one", within="[1, inf)")
     force_noise: bool = option(True, "whether the force at the tip has a bias and noise")
 
     def depth_noise(self) -> DepthNoiseOptions:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion
-from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, artflownet_module
+from fb3d_rl.models.artflownet import POINTS, ArtFlowNet, Hypotheses, artflownet_module
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.interaction import InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import Learner
@@ -49,7 +49,18 @@ NEIGHBORS = 8
 any flow, also the largest."""
 
 FLOW = ("prediction", "flow")
+FLOWS = ("prediction", "flows")
+LOG_PROBABILITIES = ("prediction", "log_probabilities")
 TRUE_FLOW = ("privileged", "flow")
+
+MOVES = 0.1
+"""A point with less than this share of the largest flow stands still."""
+
+LARGE = 0.5
+"""A contact is where a flow has more than this share of its largest."""
+
+SAME = 0.7
+"""Cosine above which two directions are the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +115,11 @@ class PolicyFlow:
         self._look, self._truth, self._masked = look, truth, masked
         self._state = TensorDict({}, [1]) if state is None else state
         self._frame: Frame | None = None
+        self._refuted: list[tuple[Array, Array]] = []
+
+    def refute(self, at: Array, way: Array) -> None:
+        """See :class:`~fb3d_rl.robot.attempt.Learns`: of several answers the next one is given that does not say so."""
+        self._refuted.append((at, way))
 
     @classmethod
     def of_policy(cls, policy: TensorDictModuleBase, truth: Truth) -> PolicyFlow:
@@ -125,7 +141,7 @@ class PolicyFlow:
     @classmethod
     def of_network(cls, net: ArtFlowNet) -> PolicyFlow:
         """Of a network that gets no mask: nobody tells a real robot which part to open."""
-        return cls(artflownet_module(net, masked=False))
+        return cls(artflownet_module(net, proposals=True, masked=False))
 
     def __call__(self, seen: Observation) -> NDArray[Any]:
         """Flow [N, 3] in the robot's base."""
@@ -144,11 +160,36 @@ class PolicyFlow:
         data = observed(few, self._frame, self._truth(few.points)).update(self._state)
         with steady_floats(), torch.no_grad():
             self._look(data)
-        flow = data[FLOW][0]
+        flow = self._answer(data, few)
         if self._masked:
             flow = flow * data["observation", "part_mask"][0, :, None]
         nearby = _nearest(few.points, seen.points, NEIGHBORS)
         return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
+
+    def _answer(self, data: TensorDict, few: Observation) -> Tensor:
+        """The flow [N, 3] that is given: of several the one that is most probable for all that may move, of those that no
+        pull refutes. A cloud of which each point has its own most probable one shows a lid and a door at once.
+        """
+        if FLOWS not in data.keys(include_nested=True):
+            return data[FLOW][0]
+        found = Hypotheses(data[FLOWS], data[LOG_PROBABILITIES])
+        about = (found.flows.norm(dim=3) > MOVES).any(1)
+        if self._masked:
+            about &= data["observation", "part_mask"]
+        order = found.of_clouds(about)[0].argsort(descending=True, stable=True).tolist()
+        left = [k for k in order if not self._is_refuted(found.flows[0, k], few)]
+        return found.flows[0, left[0] if left else order[0]]
+
+    def _is_refuted(self, flow: Tensor, few: Observation) -> bool:
+        """Whether a flow [N, 3] says what a pull has shown to be wrong."""
+        assert self._frame is not None
+        in_base, most = flow.double().numpy() @ self._frame.turn, float(flow.norm(dim=1).max())
+        for at, way in self._refuted:
+            said = np.median(in_base[_nearest(few.points, at[None], NEIGHBORS)[0]], axis=0)
+            size = float(np.linalg.norm(said))
+            if size > LARGE * most and said @ way > SAME * size:
+                return True
+        return False
 
 
 def thinned(seen: Observation, draws: int = 1) -> list[Observation]:

@@ -137,6 +137,7 @@ def attempt_options(options: RobotOptions, learner: bool = False) -> AttemptOpti
         defaults,
         place=replace(defaults.place, rim=options.rim, margin=MARGIN, slant=SLANT if options.rim else 90.0),
         points=SEEN,
+        grips=options.grips,
         deviations=defaults.deviations if options.outliers else np.inf,
         look_every=LEARNER_LOOKS if learner else defaults.look_every,
     )
