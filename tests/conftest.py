@@ -35,6 +35,13 @@ ROOT = Path(__file__).resolve().parents[1]
 Launch: TypeAlias = "Callable[..., CompletedProcess[str]]"
 
 
+@pytest.fixture(autouse=True)
+def denormals_as_usual() -> Iterator[None]:
+    """Training has denormal numbers rounded to 0 in the whole process, which the next test does not expect."""
+    yield
+    torch.set_flush_denormal(False)
+
+
 @pytest.fixture
 def two_threads() -> Iterator[None]:
     """Torch computes on two threads, however many it has otherwise."""

@@ -24,6 +24,7 @@ from fb3d_rl.robot.seeing import Motion, Seen, look, motion_at, predicted, sprea
 from fb3d_rl.robot.sight import ArmSight
 from fb3d_rl.robot.timing import Motion as Timed
 from fb3d_rl.robot.timing import timed
+from fb3d_rl.rollout.worker import denormals
 from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
@@ -75,7 +76,9 @@ def attempt(
         opened: asked in a pull whether the part is open, which ends the attempt.
         say: gets a line for each stage.
     """
-    return _Run(driver, arm, camera, predictor, options or AttemptOptions(), seed, puller, opened, say).run()
+    made = _Run(driver, arm, camera, predictor, options or AttemptOptions(), seed, puller, opened, say)
+    with denormals(flushed=False):
+        return made.run()
 
 
 class _Run:

@@ -167,8 +167,8 @@ class PolicyFlow:
         return np.asarray(np.median(flow.double().numpy()[nearby], axis=1) @ self._frame.turn)
 
     def _answer(self, data: TensorDict, few: Observation) -> Tensor:
-        """The flow [N, 3] that is given: of several the one that is most probable for all that may move, of those that no
-        pull refutes. A cloud of which each point has its own most probable one shows a lid and a door at once.
+        """The flow [N, 3] that is given: of several that no pull refutes the most probable one for all that may move. A
+        cloud of which each point has its own most probable one shows a lid and a door at once.
         """
         if FLOWS not in data.keys(include_nested=True):
             return data[FLOW][0]

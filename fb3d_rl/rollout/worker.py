@@ -29,15 +29,24 @@ def steady_floats() -> Iterator[None]:
 
     The number of threads decides how sums are split, and so the last bits of a network's output.
     """
-    threads, tiny = torch.get_num_threads(), torch.tensor(torch.finfo(torch.float32).tiny)
-    flush = bool(tiny / 2 == 0)
+    threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    torch.set_flush_denormal(True)
+    try:
+        with denormals(flushed=True):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@contextmanager
+def denormals(flushed: bool) -> Iterator[None]:
+    """Round denormal numbers to 0, or do not: SciPy's trees have crashed where they are (1.17.1)."""
+    flush = bool(torch.tensor(torch.finfo(torch.float32).tiny) / 2 == 0)
+    torch.set_flush_denormal(flushed)
     try:
         yield
     finally:
         torch.set_flush_denormal(flush)
-        torch.set_num_threads(threads)
 
 
 class EpisodeCollector(Collector):

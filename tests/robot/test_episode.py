@@ -100,6 +100,38 @@ def test_a_replayed_session_gives_the_same_commands_and_result(category: str, op
     assert differs.reason is not None and not differs.opened
 
 
+class Mistaken:
+    """It takes the object's top for a lid, until a pull there has failed."""
+
+    def __init__(self, cell: SimulatedCell) -> None:
+        self.cell, self.refuted = cell, []
+
+    def __call__(self, seen):
+        top = seen.points[:, 2] > seen.points[:, 2].max() - 0.01
+        return self.cell.flow(seen.points) if self.refuted else np.where(top[:, None], (0.0, 0.0, 1.0), 0.0)
+
+    def refute(self, at: np.ndarray, way: np.ndarray) -> None:
+        self.refuted.append((at, way))
+
+
+@pytest.mark.slow
+def test_a_pull_that_moves_nothing_refutes_the_answer_and_the_next_grip_opens(
+    things: dict[str, ArticulatedObject],
+) -> None:
+    cell = cell_with(things["Safe"], suction="perfect")
+    predictor, lines = Mistaken(cell), []
+    result = attempt(
+        cell, cell.arm, cell.believed, predictor, seed=0, opened=lambda: cell.distance() < 0.1, say=lines.append
+    )
+    assert result.opened and result.grips == 2, lines
+    [(at, way)] = predictor.refuted
+    assert way == pytest.approx((0.0, 0.0, 1.0), abs=0.05) and np.linalg.norm(result.contact - at) > 0.04
+    assert any("goes back" in line for line in lines)
+    cell = cell_with(things["Safe"], suction="perfect")
+    once = attempt(cell, cell.arm, cell.believed, Mistaken(cell), replace(AttemptOptions(), grips=1), seed=0)
+    assert once.grips == 1 and once.sealed and not once.moved and once.reason is not None
+
+
 class Still:
     """A robot that stands before an empty table; every answer can be replaced."""
 

@@ -159,6 +159,26 @@ def test_a_policys_flow_comes_back_in_the_robots_frame() -> None:
     assert np.linalg.norm(flow[0]) > np.linalg.norm(flow[-1])  # higher points move less
 
 
+def test_the_next_answer_is_given_once_a_pull_has_refuted_the_first() -> None:
+    """Outwards all of it; then, of what is left, the more probable: upwards."""
+    seen, normal = box(-0.8, (0.7, 0.1))
+
+    def answers(points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        up, down = (torch.tensor([0.0, 0.0, sign]).expand_as(points) for sign in (0.8, -1.0))
+        scores = torch.tensor([0.3, 0.5, 0.2]).log()[None, :, None].expand(len(points), 3, points.shape[1])
+        return up, torch.stack([up, outwards(points), down], 1), scores
+
+    keys = [("prediction", name) for name in ("flow", "flows", "log_probabilities")]
+    asked = PolicyFlow(TensorDictModule(answers, in_keys=[("observation", "points")], out_keys=keys))
+    contact = seen.points[0].astype(np.float64)
+    first = asked(seen)
+    assert first @ normal / np.linalg.norm(first, axis=1) == pytest.approx(np.ones(len(first)), abs=1e-3)
+    asked.refute(contact, np.array([0.0, 0.0, -1.0]))  # says nothing of the other two
+    assert np.array_equal(asked(seen), first)
+    asked.refute(contact, normal)
+    assert asked(seen)[:, 2] == pytest.approx(np.full(len(first), 0.8), abs=1e-3)
+
+
 def test_while_it_holds_the_object_is_shown_as_it_was_first_seen() -> None:
     """Seen anew, the box of the second look would be turned by half a right angle and enlarged otherwise."""
     asked = PolicyFlow.of_policy(predicting(), lambda points: np.ones((len(points), 3)))
