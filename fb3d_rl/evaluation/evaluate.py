@@ -28,6 +28,7 @@ from fb3d_rl.evaluation.tables import DECISION, show, summary
 from fb3d_rl.files import replacing, write_text
 from fb3d_rl.flow.metrics import flow_metrics
 from fb3d_rl.policies.digest import policy_digest
+from fb3d_rl.robot.rows import RobotRow
 from fb3d_rl.rollout.collectors import CollectorOptions
 from fb3d_rl.rollout.rows import FlowRow, TrialRow, read_trials, write_flow, write_trials
 from fb3d_rl.rollout.run import run_trials
@@ -172,18 +173,32 @@ def _rows_before(
     rows: dict[str, dict[int, TrialRow]] = {name: {} for name in policies}
     digests = {name: policy_digest(policy) for name, policy in policies.items()}
     for row in read_trials(path) if path.is_file() else []:
-        of_row = f"{row.policy} with {row.category} {row.object}"
-        remedy = "evaluate in another folder: hydra.run.dir=DIR"
-        if row.trial >= len(keys) or row.key != keys[row.trial]:
-            raise UserError(
-                f"{path} holds trial {row.trial}, {of_row}, which is not the one that is scheduled; {remedy}"
-            )
-        if row.policy_digest != digests.get(row.policy):
-            raise UserError(
-                f"{path} holds a trial of {of_row}, run by other weights or options than this evaluation has; {remedy}"
-            )
+        key = keys[row.trial] if row.trial < len(keys) else None
+        refuse_other(path, row, key, digests.get(row.policy))
         rows[row.policy][row.trial] = row
     return rows
+
+
+def refuse_other(path: Path, row: TrialRow | RobotRow, key: str | None, digest: str | None) -> None:
+    """Refuse a row of an earlier run that is of another trial or of another policy.
+
+    Args:
+        path: of the rows, for the message.
+        row: the row.
+        key: of the trial that is scheduled under its number; None if none is.
+        digest: of the policy of its name; None if there is none.
+
+    Raises:
+        UserError: it is of others.
+    """
+    of_row = f"{row.policy} with {row.category} {row.object}"
+    remedy = "evaluate in another folder: hydra.run.dir=DIR"
+    if row.key != key:
+        raise UserError(f"{path} holds trial {row.trial}, {of_row}, which is not the one that is scheduled; {remedy}")
+    if row.policy_digest != digest:
+        raise UserError(
+            f"{path} holds a trial of {of_row}, run by other weights or options than this evaluation has; {remedy}"
+        )
 
 
 class DecisionTimes:

@@ -10,8 +10,7 @@ from typing import Any
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
-from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.evaluate import progress_bars
+from fb3d_rl.evaluation.evaluate import progress_bars, refuse_other
 from fb3d_rl.evaluation.robot_tables import stage_table, trial_table, write_tables
 from fb3d_rl.evaluation.tables import print_tables, summary
 from fb3d_rl.files import write_text
@@ -88,10 +87,7 @@ def _rows_before(path: Path, blanks: Mapping[str, Sequence[RobotRow]]) -> dict[t
     rows = read_robot(path) if path.is_file() else []
     for row in rows:
         scheduled = blanks.get(row.policy, ())
-        same = row.trial < len(scheduled) and row.key == scheduled[row.trial].key
-        if not same or row.policy_digest != scheduled[row.trial].policy_digest:
-            raise UserError(
-                f"{path} holds trial {row.trial}, {row.policy} with {row.object}, which is not what this evaluation "
-                "runs; evaluate in another folder: hydra.run.dir=DIR"
-            )
+        blank = scheduled[row.trial] if row.trial < len(scheduled) else None
+        expected = (None, None) if blank is None else (blank.key, blank.policy_digest)
+        refuse_other(path, row, *expected)
     return {(row.policy, row.trial): row for row in rows}

@@ -23,7 +23,7 @@ from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.env.umpnet.options import UmpnetOptions
 from fb3d_rl.env.umpnet.scenes import Placed, Scene, place
 from fb3d_rl.errors import UserError
-from fb3d_rl.evaluation.evaluate import progress_bars
+from fb3d_rl.evaluation.evaluate import progress_bars, refuse_other
 from fb3d_rl.evaluation.tables import DISTANCE, SUCCESS, Metric, measure
 from fb3d_rl.files import write_text
 from fb3d_rl.policies.digest import policy_digest
@@ -163,11 +163,7 @@ def _before(
     digests = {name: policy_digest(policy) for name, policy in named.items()}
     found = read_details(path)
     for row in (detail.row for detail in found):
-        if row.key != keys.get(row.trial) or row.policy_digest != digests.get(row.policy):
-            raise UserError(
-                f"{path} holds trial {row.trial} of {row.policy}, which is not the one of this evaluation; evaluate in "
-                "another folder: hydra.run.dir=DIR"
-            )
+        refuse_other(path, row, keys.get(row.trial), digests.get(row.policy))
     return found
 
 
