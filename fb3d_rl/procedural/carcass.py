@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -66,6 +66,10 @@ class Carcass:
     free_swing: Range = (1.4, 2.2)
 
 
+BESIDE = 0.0025
+"""Least distance (m) between a wall and the front of an open door that is set in beside it."""
+
+
 def scaled_size(width: float, height: float, depth: float, diagonal: float = 1.94) -> tuple[float, float, float]:
     """The proportions as a size (m) with the given diagonal; PartNet's is 2 m, handles included."""
     scale = diagonal / float(np.linalg.norm([width, height, depth]))
@@ -121,7 +125,11 @@ def build(rng: np.random.Generator, carcass: Carcass) -> tuple[list[Piece], list
         free = {"left": i == 0, "right": i == len(carcass.columns) - 1}
         for part_x, side in _leaves(cell, px, gap):
             swing = carcass.free_swing if free.get(side) else (1.25, np.pi / 2)
-            parts.append(hinged_door(carcass.door, style, side, part_x, py, face, rng.uniform(*swing)))
+            door = hinged_door(carcass.door, style, side, part_x, py, face, rng.uniform(*swing))
+            if carcass.inset and free.get(side):  # opened all the way, its front must not lie on the wall beside it
+                beside = abs(cell_x[side == "right"] - door.origin[0])
+                door = replace(door, upper=min(door.upper, np.pi - float(np.arcsin(BESIDE / beside))))
+            parts.append(door)
         if cell.kind == "drawer":
             parts.append(_drawer(rng, carcass, px, py, face, cell_x, cell_y, inner_z))
         elif cell.kind == "controls":
