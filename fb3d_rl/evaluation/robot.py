@@ -16,8 +16,8 @@ from fb3d_rl.evaluation.tables import print_tables, summary
 from fb3d_rl.files import write_text
 from fb3d_rl.robot.options import RobotOptions
 from fb3d_rl.robot.rows import FILE, RobotRow, read_robot, write_robot
-from fb3d_rl.robot.trials import blank_rows, run_trials, schedule, session_of
-from fb3d_rl.rollout.rows import write_trials
+from fb3d_rl.robot.trials import RobotTrial, Session, blank_rows, run_trial, run_trials, schedule, session_of
+from fb3d_rl.rollout.rows import film_name, write_trials
 
 
 def evaluate_robot(
@@ -29,11 +29,12 @@ def evaluate_robot(
     workers: int,
     resume: bool,
     facts: Mapping[str, Any],
+    videos: int = 0,
 ) -> list[RobotRow]:
     """Run the robot's trials with every policy.
 
     Writes robot.csv as they come; then rows.csv, the same in the columns of other trials, summary.json, and the tables
-    of the supplement, robot_tables.md and robot_tables.csv.
+    of the supplement, robot_tables.md and robot_tables.csv; and videos/, films of some trials.
 
     Args:
         out: the run folder.
@@ -44,6 +45,7 @@ def evaluate_robot(
         workers: processes.
         resume: keep the rows that are there.
         facts: entries for summary.json.
+        videos: of so many objects the first trial is filmed with every policy.
 
     Returns:
         One row for each trial and policy.
@@ -71,7 +73,30 @@ def evaluate_robot(
     if rows:
         write_tables(out, rows)
         print_tables([*(trial_table(rows, name) for name in policies), stage_table(rows)], Console())
+    _film(out, rows, policies, trials, session, options, videos)
     return rows
+
+
+def _film(
+    out: Path,
+    rows: Sequence[RobotRow],
+    policies: Mapping[str, TensorDictModuleBase],
+    trials: Sequence[RobotTrial],
+    session: Session,
+    options: RobotOptions,
+    count: int,
+) -> None:
+    """Run the first trials of ``count`` objects again, filmed; those that crashed or have their films are left out."""
+    objects = list(dict.fromkeys(trial.listed.label for trial in trials))[:count]
+    folder = out / "videos"
+    named = [(row, folder / film_name(row.as_trial())) for row in rows if row.repeat == 0 and row.object in objects]
+    wanted = [(row, path) for row, path in named if row.status == "ok" and not Path(f"{path}.png").is_file()]
+    if not wanted:
+        return
+    folder.mkdir(exist_ok=True)
+    with progress_bars() as bar:
+        for row, path in bar.track(wanted, description="videos"):
+            run_trial(trials[row.trial], session, options, policies[row.policy], row, out / "objects", path)
 
 
 def _ordered(done: Mapping[tuple[str, int], RobotRow], policies: Mapping[str, Any]) -> list[RobotRow]:

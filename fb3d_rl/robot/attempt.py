@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 STAGES = ("seen", "segmented", "planned", "touched", "sealed", "moved", "opened")
 """What has to go well, in this order."""
 
+OPEN = 0.1
+"""A part is open if less than this share of the opening is left (supplement, IV: opened by more than 90 %)."""
+
 
 @dataclass(frozen=True)
 class AttemptOptions:

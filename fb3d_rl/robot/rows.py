@@ -50,6 +50,7 @@ class RobotRow:
         way: how far the held point moved, m.
         off: how far the touch was from the chosen contact, m; -1 without a touch.
         force: largest force at the tip, N.
+        grips: how many times the arm went to touch.
         seconds: of the robot's clock, s.
         wall: what the trial took on the machine, s of the processor; not the same in two runs.
         key: what the trial is; :func:`fb3d_rl.robot.trials.key_of`.
@@ -85,6 +86,7 @@ class RobotRow:
     way: float = 0.0
     off: float = -1.0
     force: float = 0.0
+    grips: int = 0
     seconds: float = 0.0
     wall: float = 0.0
     key: str = ""

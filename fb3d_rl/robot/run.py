@@ -21,7 +21,7 @@ from fb3d_rl.importer.catalog import find_objects
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.procedural import FAMILIES, generate
 from fb3d_rl.robot.arm import Arm, load_arm, panda, sawyer
-from fb3d_rl.robot.attempt import Predictor
+from fb3d_rl.robot.attempt import OPEN, Predictor
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.episode import attempt
 from fb3d_rl.robot.film import Filmed
@@ -31,9 +31,6 @@ from fb3d_rl.robot.simulated import CellOptions, SimulatedCell
 from fb3d_rl.robot.table import on_table
 
 Array = NDArray[np.float64]
-
-OPEN = 0.1
-"""A simulated part is open below this normalised distance."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +110,7 @@ def make_attempt(settings: Settings, load: Callable[[str], ArtFlowNet], say: Cal
     filmed = recorder = None
     if settings.video is not None and made.cell is not None:
         require_encoder()
-        driver = filmed = Filmed(made.cell)
+        driver = filmed = Filmed(made.cell, f"{settings.object} · {made.policy}")
     if settings.record is not None:
         about = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(settings).items()}
         about |= {"judged": opened is not None, "T_base_camera": made.camera.tolist()}

@@ -24,10 +24,11 @@ from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.robot.arm import Arm, panda, sawyer
-from fb3d_rl.robot.attempt import STAGES, AttemptOptions
+from fb3d_rl.robot.attempt import OPEN, STAGES, AttemptOptions
 from fb3d_rl.robot.calibration import calibrated, pose_error
 from fb3d_rl.robot.calibration_session import simulate
 from fb3d_rl.robot.episode import attempt
+from fb3d_rl.robot.film import Filmed
 from fb3d_rl.robot.marker import Marker
 from fb3d_rl.robot.objects import SEED, TABLE_I, Listed, make, on_table
 from fb3d_rl.robot.options import RobotOptions
@@ -38,9 +39,6 @@ from fb3d_rl.rollout.run import mask_of
 from fb3d_rl.seeds import derived
 
 Array = NDArray[np.float64]
-
-OPEN = 0.1
-"""A part is open if less than this share of the opening is left (supplement, IV: opened by more than 90 %)."""
 
 ENOUGH = 0.02
 """A pull ends when less than this is left: the distance that is measured is not that of the first success."""
@@ -169,6 +167,7 @@ def run_trial(
     policy: TensorDictModuleBase,
     blank: RobotRow,
     folder: Path,
+    film: Path | None = None,
 ) -> RobotRow:
     """Run a trial.
 
@@ -179,6 +178,7 @@ def run_trial(
         policy: what is asked for the flow (:func:`~fb3d_rl.robot.policy_flow.asking`).
         blank: the trial's row, with nothing achieved.
         folder: of the objects.
+        film: where a film (.mp4) and a filmstrip (.png) of it are written, without their suffixes.
     """
     began = time.process_time()
     threads = torch.get_num_threads()
@@ -188,12 +188,17 @@ def run_trial(
         o = attempt_options(options)
         predictor, puller = asking(policy, cell.flow, o.pull_speed)
         o = attempt_options(options, puller is not None)
+        filmed = None if film is None else Filmed(cell, f"{trial.listed.label} · {blank.policy}")
         made = attempt(
-            cell, cell.arm, cell.believed, predictor, o, trial.seed, puller, lambda: cell.distance() < ENOUGH
-        )
-        distance, seconds = cell.distance(), cell.joints().time
+            filmed or cell, cell.arm, cell.believed, predictor, o, trial.seed, puller,
+            lambda: cell.distance() < ENOUGH, None if filmed is None else filmed.say,
+        )  # fmt: skip
+        distance, seconds, wall = cell.distance(), cell.joints().time, time.process_time() - began
     finally:
         torch.set_num_threads(threads)
+    if filmed is not None and film is not None:
+        filmed.write(film.with_name(film.name + ".mp4"))
+        filmed.write_filmstrip(film.with_name(film.name + ".png"))
     passed: dict[str, Any] = {stage: bool(getattr(made, stage)) for stage in STAGES}
     passed["opened"] = made.moved and distance < OPEN
     off = float(np.linalg.norm(made.felt - made.contact))
@@ -208,7 +213,8 @@ def run_trial(
         off=off if np.isfinite(off) else -1.0,
         force=float(np.linalg.norm(made.forces, axis=1).max(initial=0.0)),
         seconds=seconds,
-        wall=time.process_time() - began,
+        grips=made.grips,
+        wall=wall,
     )
 
 

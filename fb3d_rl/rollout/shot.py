@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -160,8 +161,26 @@ def _anchors(film: Film) -> NDArray[np.float64]:
     return chosen[[bool((gaps[i, :i] > 0.01).all()) for i in range(len(chosen))]]
 
 
-def moments(film: Film) -> list[tuple[str, int]]:
-    """Up to six important moments of a film, in order, each with its name."""
+class Course(Protocol):
+    """What a film tells of its moments; see :class:`~fb3d_rl.rollout.film.Film`."""
+
+    @property
+    def attached(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def opened(self) -> NDArray[np.floating]: ...
+
+    @property
+    def tips(self) -> NDArray[np.floating]: ...
+
+    @property
+    def success(self) -> bool: ...
+
+    def __len__(self) -> int: ...
+
+
+def moments(film: Course, called: Callable[[int], str] = "step {}".format) -> list[tuple[str, int]]:
+    """Up to six important moments of a film, in order, each with its name; ``called`` names those without one."""
     last = len(film) - 1
     if film.attached.any():
         contact = int(film.attached.argmax())
@@ -175,8 +194,8 @@ def moments(film: Film) -> list[tuple[str, int]]:
                 chosen.append((name, contact + int(reached.argmax())))
             else:
                 t = contact + round(share * (last - contact))
-                chosen.append((f"step {t}", t))
+                chosen.append((called(t), t))
     else:
-        chosen = [("start", 0)] + [(f"step {t}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
+        chosen = [("start", 0)] + [(called(t), t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
     end = ("opened" if film.success else "end", last)
     return [item for item, after in zip(chosen, [*chosen[1:], end], strict=True) if item[1] < after[1]] + [end]

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import ImageDraw
 from tensordict.nn import TensorDictModuleBase
 
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.bodies import TARGET
-from fb3d_rl.drawing.signs import FAINT, FREE, HOLDING, INK, TRACK, font, hex_color
+from fb3d_rl.drawing.caption import CAPTION, Still, captioned, filmstrip, still_width
+from fb3d_rl.drawing.signs import FAINT, TRACK, font
 from fb3d_rl.drawing.video import encode
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.files import replacing
@@ -28,9 +28,6 @@ EXPERT, LEARNER = "#3b4252", "#e8a33d"
 
 SIZE = (480, 360)
 """Width and height (pixels) of a video's pictures."""
-
-CAPTION = 40
-"""Height (pixels) of the caption below them."""
 
 STRIP_WIDTH = 1600
 """Width (pixels) of a filmstrip."""
@@ -61,22 +58,9 @@ def _draw_actors(draw: ImageDraw.ImageDraw, film: Film, box: tuple[int, int, int
 def frames(film: Film, size: tuple[int, int] = SIZE, view: View | None = None) -> Iterator[NDArray[np.uint8]]:
     """The film's pictures of that ``size`` with a caption below each: one for each moment, [H + CAPTION, W, 3]."""
     shot = Shot(film, *size, view)
-    width, height = size
-    small, usual = font(12), font(13)
-    middle = height + CAPTION // 2 + 2
     for t in range(len(film)):
-        image = Image.new("RGB", (width, height + CAPTION), "white")
-        image.paste(Image.fromarray(shot.picture(t)))
-        draw = ImageDraw.Draw(image)
-        draw.text((10, 8), _title(film), FAINT, small)
-        draw.rectangle((0, height, width, height + 3), TRACK)
-        draw.rectangle((0, height, round(width * float(film.opened[t])), height + 3), hex_color(TARGET))
-        _draw_actors(draw, film, (0, 0, width, 5), t)
-        draw.text((10, middle), _state(film, t), INK, usual, anchor="lm")
-        word = "holding" if film.attached[t] else "not holding"
-        draw.text((width - 10, middle), word, INK, usual, anchor="rm")
-        x = width - 24 - draw.textlength(word, usual)
-        draw.ellipse((x - 5, middle - 5, x + 5, middle + 5), hex_color(HOLDING if film.attached[t] else FREE))
+        image = captioned(shot.picture(t), _title(film), _state(film, t), float(film.opened[t]), bool(film.attached[t]))
+        _draw_actors(ImageDraw.Draw(image), film, (0, 0, size[0], 5), t)
         yield np.asarray(image)
 
 
@@ -95,28 +79,16 @@ def write_video(film: Film, path: Path, size: tuple[int, int] = SIZE, view: View
 def write_filmstrip(film: Film, path: Path, width: int = STRIP_WIDTH, view: View | None = None) -> None:
     """Write a PNG of that ``width`` (pixels): the film's :func:`moments` side by side, with a caption below each."""
     shown = moments(film)
-    gap, line = width // 130, width // 70
-    side = (width - gap * (len(shown) - 1)) // len(shown)
-    shot = Shot(film, 2 * side, view=view)
-    tall = shot.camera.size[1] // 2
-    bold, usual = font(width // 100, bold=True), font(width // 114)
-    top = round(1.4 * line)
-    image = Image.new("RGB", (width, top + tall + 3 * line), "white")
+    shot = Shot(film, 2 * still_width(len(shown), width), view=view)
+    image = filmstrip([Still(name, _state(film, t), shot.picture(t)) for name, t in shown], _title(film), width)
     draw = ImageDraw.Draw(image)
-    draw.text((0, 0), _title(film), FAINT, usual)
-    for place, (name, t) in enumerate(shown):
-        left, below = place * (side + gap), top + tall + line // 3
-        picture = Image.fromarray(shot.picture(t)).resize((side, tall), Image.Resampling.BOX)
-        image.paste(picture, (left, top))
-        draw.text((left, below), name, INK, bold)
-        draw.text((left, below + round(1.1 * line)), _state(film, t), FAINT, usual)
     if film.expert_acts is not None:
         _draw_actors(draw, film, (0, image.height - 8, width, image.height), len(film) - 1)
         share = 100 * film.expert_acts.mean()
         said = (
             f"below: who acted, from the first step to the last: the expert (dark, {share:.0f} %), the learner (light)"
         )
-        draw.text((width, 0), said, FAINT, usual, anchor="ra")
+        draw.text((width, 0), said, FAINT, font(width // 114), anchor="ra")
     with replacing(path) as part:
         image.save(part)
 

@@ -6,22 +6,25 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from fb3d_rl.errors import UserError
+from fb3d_rl.evaluation.robot import evaluate_robot
 from fb3d_rl.policies.baselines import random_policy
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis
 from fb3d_rl.policies.interaction import InteractivePolicy, OracleGate
 from fb3d_rl.policies.learner import Learner
 from fb3d_rl.policies.options import FlowPolicyOptions, LearnerOptions
-from fb3d_rl.robot import trials
+from fb3d_rl.robot import film, trials
 from fb3d_rl.robot.attempt import Observation
 from fb3d_rl.robot.objects import TABLE_I
 from fb3d_rl.robot.options import RobotOptions
@@ -288,11 +291,33 @@ def test_a_crash_costs_its_trial_only(workers: int, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.slow
-def test_the_expert_lifts_a_lid_the_same_way_twice(tmp_path: Path) -> None:
+def test_the_expert_lifts_a_lid_and_again_when_it_is_filmed(tmp_path: Path) -> None:
     pytest.importorskip("sapien")
     (trial,) = (t for t in schedule(replace(IDEAL, trials=1), 0) if t.listed.label == "jar_1")
     session, policy = session_of(IDEAL, 0), expert_policy(LIMITS)
     blanks = blank_rows("expert", policy, [trial], session, IDEAL)
-    first, second = (next(run_trials(policy, {0: trial}, blanks, session, IDEAL, tmp_path, 1)) for _ in range(2))
-    assert first.opened and first.sealed and first.distance < 0.1 and first.reason == ""
+    first = next(run_trials(policy, {0: trial}, blanks, session, IDEAL, tmp_path, 1))
+    second = trials.run_trial(trial, session, IDEAL, policy, blanks[0], tmp_path, tmp_path / "film")
+    assert first.opened and first.sealed and first.distance < 0.1 and first.reason == "" and first.grips == 1
     assert replace(first, wall=0.0) == replace(second, wall=0.0)
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))
+    assert frames / seconds == pytest.approx(film.RATE, abs=0.5)
+    assert first.seconds - 0.5 < seconds - film.HOLD < first.seconds + 0.5  # in the robot's own time
+    with Image.open(tmp_path / "film.png") as strip:
+        pixels = np.asarray(strip).astype(int).reshape(-1, 3)
+    red, green, blue = pixels.T  # of the cup before it holds, and while it does
+    assert (red > 2 * np.maximum(green, blue)).sum() > 50
+    assert (green > 2 * red).sum() > 50
+
+
+@pytest.mark.slow
+def test_as_many_objects_are_filmed_as_is_asked(tmp_path: Path) -> None:
+    pytest.importorskip("sapien")
+    few = replace(IDEAL, trials=1)
+    arguments = (tmp_path, {"expert": expert_policy(LIMITS)}, few, 0, 2, 1)
+    rows = evaluate_robot(*arguments, False, {}, videos=1)
+    films = sorted(path.name for path in (tmp_path / "videos").iterdir())
+    assert films == [f"000_{rows[0].object}__expert{suffix}" for suffix in (".mp4", ".png")]
+    before = [(tmp_path / "videos" / name).stat().st_mtime_ns for name in films]
+    assert evaluate_robot(*arguments, True, {}, videos=1) == rows
+    assert [(tmp_path / "videos" / name).stat().st_mtime_ns for name in films] == before
