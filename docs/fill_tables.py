@@ -19,6 +19,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from robot_results import robot, robot_ablation  # a file beside this one
+
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), *sorted(RESULTS.glob("**/*.md")))
@@ -421,7 +423,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     for function in (
         headline, imitation, imitation_unseen, imitation_partnet_mobility, comparison, procedural, partnet_mobility,
         flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
-        learning_curve_seeds,
+        learning_curve_seeds, robot, robot_ablation,
     )
 }  # fmt: skip
 

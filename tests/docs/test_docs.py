@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import runpy
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from fb3d_rl.procedural.spec import ObjectSpec, Part, write_object
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted(DOCS.glob("*.md")), *sorted((ROOT / "results").glob("**/*.md"))]
+sys.path.insert(0, str(DOCS))  # as for `python docs/fill_tables.py`
 TABLES = runpy.run_path(str(DOCS / "fill_tables.py"))
 NOTEBOOK: dict[str, Any] = json.loads((DOCS / "tutorial.ipynb").read_text())
 
