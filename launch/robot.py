@@ -65,7 +65,9 @@ def _run_parser(commands: Any) -> None:
     run.add_argument("--driver", default="simulated", help=driver)
     run.add_argument("--object", default="Microwave", help="on the simulated table: a category, or an object's folder")
     run.add_argument("--part", help="link of the object to open (default: the largest that opens)")
-    run.add_argument("--arm", default="sawyer", help="sawyer, panda, or URDF:JOINT,JOINT,...:FLANGE (default: sawyer)")
+    run.add_argument(
+        "--arm", default="sawyer", help="sawyer, panda, URDF:FLANGE or URDF:JOINT,JOINT,...:FLANGE (default: sawyer)"
+    )
     calibration = "of calibrate (default: the simulated cell's truth)"
     run.add_argument("--calibration", type=Path, metavar="FILE", help=calibration)
     policy = "weights, a run folder, pretrained, or expert: the simulated truth (default: pretrained)"

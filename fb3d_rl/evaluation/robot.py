@@ -14,6 +14,7 @@ from fb3d_rl.evaluation.evaluate import progress_bars, refuse_other
 from fb3d_rl.evaluation.robot_tables import stage_table, trial_table, write_tables
 from fb3d_rl.evaluation.tables import print_tables, summary
 from fb3d_rl.files import write_text
+from fb3d_rl.robot.arm import named_arm
 from fb3d_rl.robot.options import RobotOptions
 from fb3d_rl.robot.rows import FILE, RobotRow, read_robot, write_robot
 from fb3d_rl.robot.trials import RobotTrial, Session, blank_rows, run_trial, run_trials, schedule, session_of
@@ -51,8 +52,9 @@ def evaluate_robot(
         One row for each trial and policy.
 
     Raises:
-        UserError: the rows to resume from are of other trials or policies.
+        UserError: there is no such arm, or the rows to resume from are of other trials or policies.
     """
+    named_arm(options.arm)  # a file that holds none ends here
     session, trials = session_of(options, seed), schedule(options, seed, limit)
     blanks = {name: blank_rows(name, policy, trials, session, options) for name, policy in policies.items()}
     done = _rows_before(out / FILE, blanks) if resume else {}

@@ -132,9 +132,24 @@ def panda() -> Arm:
     return load_arm(urdf, [f"panda_joint{i}" for i in range(1, 8)], "panda_link8", home=home)
 
 
+@cache
+def named_arm(name: str) -> Arm:
+    """The arm of an option: sawyer, panda, URDF:FLANGE with all joints that turn the flange, or URDF:JOINT,...:FLANGE.
+
+    Raises:
+        UserError: the name is none of these, or the file holds no such arm.
+    """
+    if name in ("sawyer", "panda"):
+        return sawyer() if name == "sawyer" else panda()
+    urdf, *joints, flange = name.split(":") if name.count(":") in (1, 2) else ("", "")
+    if not urdf:
+        raise UserError(f"the arm {name} is unknown; choose sawyer or panda, or give URDF:FLANGE, the link of the cup")
+    return load_arm(urdf, joints[0].split(",") if joints else None, flange)
+
+
 def load_arm(
     urdf: str | Path,
-    joints: Sequence[str],
+    joints: Sequence[str] | None,
     tip: str,
     cup: Sequence[Capsule] = CUP,
     cup_length: float = CUP_LENGTH,
@@ -148,7 +163,7 @@ def load_arm(
 
     Args:
         urdf: the file.
-        joints: the names of the joints that move the flange, from the base on; they turn.
+        joints: the names of the joints that move the flange, from the base on; they turn. None for all that turn it.
         tip: the link that the cup is mounted on, the flange; the cup points along its z axis.
         cup: the bodies of cup and gripper, in the frame of the cup's opening.
         cup_length: from the flange to the cup's opening, m.
@@ -160,17 +175,18 @@ def load_arm(
     path = Path(urdf).expanduser()
     links, speeds = _read(path)
     moved, flange = _arm_links(links, joints, tip)
+    names = [links.joint_of(i).name for i in moved]
     chain = _chain(links, moved, flange, cup_length)
     lower, upper = torch.as_tensor(chain.limits).unbind(-1)
     bodies = [(len(chain.links) - 1, capsule) for capsule in cup] + _bodies(links, moved, flange)
     return Arm(
         name=path.stem,
         urdf=path,
-        joints=tuple(joints),
+        joints=tuple(names),
         tree=KinematicTree.from_object(chain),
         lower=lower,
         upper=upper,
-        velocity=torch.tensor([speeds.get(name) or np.inf for name in joints], dtype=torch.float64),
+        velocity=torch.tensor([speeds.get(name) or np.inf for name in names], dtype=torch.float64),
         home=(lower + upper) / 2 if home is None else torch.tensor(home, dtype=torch.float64),
         links=np.array([link for link, _ in bodies]),
         ends=np.stack([capsule.ends for _, capsule in bodies]),
@@ -188,7 +204,7 @@ def _read(path: Path) -> tuple[ArticulatedObject, dict[str | None, float]]:
     return links, {name: float(limit.get("velocity") or "inf") for name, limit in limits if limit is not None}
 
 
-def _arm_links(obj: ArticulatedObject, joints: Sequence[str], tip: str) -> tuple[list[int], int]:
+def _arm_links(obj: ArticulatedObject, joints: Sequence[str] | None, tip: str) -> tuple[list[int], int]:
     """The links behind an arm's joints and its flange, as indices."""
     names = [link.name for link in obj.links]
     if tip not in names:
@@ -198,6 +214,10 @@ def _arm_links(obj: ArticulatedObject, joints: Sequence[str], tip: str) -> tuple
     while obj.links[way[0]].parent >= 0:
         way.insert(0, obj.links[way[0]].parent)
     movable = [i for i in way[1:] if obj.joint_of(i).movable]
+    if joints is None:
+        joints = [obj.joint_of(i).name for i in movable if obj.joint_of(i).type != "prismatic"]
+    if not joints:
+        raise UserError(f"{obj.urdf}: no joint turns {tip}")
     moved = [i for i in movable if obj.joint_of(i).name in joints]
     if [obj.joint_of(i).name for i in moved] != list(joints):
         here = ", ".join(obj.joint_of(i).name for i in movable) or "none"

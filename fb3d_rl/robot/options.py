@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from fb3d_rl.camera.noise import PRESETS, TERMS, DepthNoiseOptions
 from fb3d_rl.errors import UserError
@@ -14,7 +14,10 @@ from fb3d_rl.options import option
 class RobotOptions:
     """Trials of a robot arm in its cell: of protocol=robot alone."""
 
-    arm: Literal["sawyer", "panda"] = option("sawyer", "the arm")
+    arm: str = option(
+        "sawyer",
+        "the arm: sawyer, panda, or URDF:FLANGE, a file and the link that the cup is mounted on, along its z axis",
+    )
     trials: int = option(5, "trials of each object, each with a pose of its own", within="[1, inf)")
     noise: str = option("azure_kinect", "the depth camera's errors", among=PRESETS)
     without: list[str] = option([], "terms of these errors to leave out: " + ", ".join(TERMS))

@@ -20,7 +20,7 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.importer.catalog import find_objects
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.procedural import FAMILIES, generate
-from fb3d_rl.robot.arm import Arm, load_arm, panda, sawyer
+from fb3d_rl.robot.arm import Arm, named_arm
 from fb3d_rl.robot.attempt import OPEN, Predictor
 from fb3d_rl.robot.driver import Driver
 from fb3d_rl.robot.episode import attempt
@@ -136,13 +136,13 @@ def _setting(settings: Settings) -> _Setting:
         try:
             judge = replay.opened if about["judged"] else None
             camera, policy, seed = np.array(about["T_base_camera"]), str(about["policy"]), int(about["seed"])
-            arm = _arm(str(about["arm"]))
+            arm = named_arm(str(about["arm"]))
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{settings.session}/session.json does not say what was run: {error}") from error
         if policy == "expert":
             raise UserError("a session of the expert cannot be replayed: the truth that it saw is not recorded")
         return _Setting(replay, arm, camera, policy, seed, judge)
-    arm = _arm(settings.arm)
+    arm = named_arm(settings.arm)
     calibration = None if settings.calibration is None else _calibration(settings.calibration)
     if settings.driver != "simulated":
         assert calibration is not None
@@ -170,15 +170,6 @@ def _calibration(path: Path) -> dict[str, Any]:
     if pose.shape != (4, 4) or not np.isfinite(pose).all() or abs(np.linalg.det(pose[:3, :3]) - 1.0) > 1e-3:
         raise UserError(f"{path}: T_base_camera is no pose, 4 x 4")
     return content
-
-
-def _arm(name: str) -> Arm:
-    if name in ("sawyer", "panda"):
-        return sawyer() if name == "sawyer" else panda()
-    if name.count(":") != 2:
-        raise UserError(f"--arm {name} is unknown; choose sawyer or panda, or give URDF:JOINT,JOINT,...:FLANGE")
-    urdf, joints, flange = name.split(":")
-    return load_arm(urdf, joints.split(","), flange)
 
 
 def _own(name: str) -> Driver:

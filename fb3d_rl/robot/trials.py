@@ -23,7 +23,7 @@ from tensordict.nn import TensorDictModuleBase
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.policies.digest import policy_digest
-from fb3d_rl.robot.arm import Arm, panda, sawyer
+from fb3d_rl.robot.arm import named_arm
 from fb3d_rl.robot.attempt import OPEN, STAGES, AttemptOptions
 from fb3d_rl.robot.calibration import calibrated, pose_error
 from fb3d_rl.robot.calibration_session import simulate
@@ -123,11 +123,6 @@ def key_of(trial: RobotTrial, session: Session, options: RobotOptions) -> str:
     return hashlib.sha256(json.dumps(whole).encode()).hexdigest()[:16]
 
 
-def arm_of(options: RobotOptions) -> Arm:
-    """The arm that the options name."""
-    return panda() if options.arm == "panda" else sawyer()
-
-
 def attempt_options(options: RobotOptions, learner: bool = False) -> AttemptOptions:
     """How attempts are made."""
     defaults = AttemptOptions()
@@ -152,7 +147,7 @@ def cell_of(trial: RobotTrial, obj: ArticulatedObject, session: Session, options
         force_noise=felt[1],
     )
     content, error = on_table(trial.listed, obj, trial.place), np.array(session.error)
-    return SimulatedCell(arm_of(options), content, cell, session.seed, trial.seed, error)
+    return SimulatedCell(named_arm(options.arm), content, cell, session.seed, trial.seed, error)
 
 
 @lru_cache(maxsize=len(TABLE_I))

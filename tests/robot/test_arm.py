@@ -14,7 +14,7 @@ import trimesh
 from fb3d_rl.assets.articulation import Mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import rotate
-from fb3d_rl.robot.arm import CUP_LENGTH, SAWYER, Arm, load_arm, panda, sawyer
+from fb3d_rl.robot.arm import CUP_LENGTH, SAWYER, Arm, load_arm, named_arm, panda, sawyer
 from fb3d_rl.robot.capsules import Capsule, enclosing_capsule, enclosing_capsules, point_distance
 from fb3d_rl.robot.inverse import rotation_vector
 
@@ -83,6 +83,18 @@ def test_an_arm_of_two_joints_follows_its_closed_form(planar: Path) -> None:
         np.testing.assert_allclose(tip[:3, 3], [x, y, 0.0], atol=1e-12)
         np.testing.assert_allclose(tip[:3, 2], [math.cos(a + b), math.sin(a + b), 0.0], atol=1e-12)
     assert arm.velocity.tolist() == [0.5, math.inf]
+
+
+def test_an_option_names_an_arm_by_its_file_and_flange(planar: Path) -> None:
+    arm = named_arm(f"{planar}:hand")
+    assert arm.joints == ("shoulder", "elbow")  # what slides does not turn it
+    assert named_arm(f"{planar}:shoulder,elbow:hand").joints == arm.joints
+    assert named_arm("panda") is panda()
+    for name in ("ur5", f"{planar}", f"{planar}:a:b:c"):
+        with pytest.raises(UserError, match="is unknown; choose sawyer or panda"):
+            named_arm(name)
+    with pytest.raises(UserError, match="no joint turns ground"):
+        named_arm(f"{planar}:ground")
 
 
 @pytest.mark.parametrize(
