@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from tensordict.nn import TensorDictModuleBase
 
@@ -16,6 +17,7 @@ from fb3d_rl.evaluation.tables import print_tables, summary
 from fb3d_rl.files import write_text
 from fb3d_rl.robot.arm import named_arm
 from fb3d_rl.robot.options import RobotOptions
+from fb3d_rl.robot.policy_flow import asking
 from fb3d_rl.robot.rows import FILE, RobotRow, read_robot, write_robot
 from fb3d_rl.robot.trials import RobotTrial, Session, blank_rows, run_trial, run_trials, schedule, session_of
 from fb3d_rl.rollout.rows import film_name, write_trials
@@ -52,9 +54,12 @@ def evaluate_robot(
         One row for each trial and policy.
 
     Raises:
-        UserError: there is no such arm, or the rows to resume from are of other trials or policies.
+        UserError: there is no such arm, no robot can follow a policy, or the rows to resume from are of other trials
+            or policies.
     """
-    named_arm(options.arm)  # a file that holds none ends here
+    named_arm(options.arm)  # a file that holds none ends here, and so does a policy that no robot can follow
+    for policy in policies.values():
+        asking(policy, np.zeros_like, 1.0)
     session, trials = session_of(options, seed), schedule(options, seed, limit)
     blanks = {name: blank_rows(name, policy, trials, session, options) for name, policy in policies.items()}
     done = _rows_before(out / FILE, blanks) if resume else {}

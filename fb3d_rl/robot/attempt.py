@@ -55,6 +55,11 @@ class AttemptOptions:
         "m/(s N)",
         "[0, inf)",
     )
+    pictures: int = option(
+        1,
+        "pictures that are taken, and their depth's median, where nothing moves; the supplement has one",
+        within="[1, inf)",
+    )
     look_every: float = option(1.0, "time between pictures in a pull", "s", "(0, inf)")
     most_force: float = option(35.0, "force that ends an attempt", "N", "(0, inf)")
     stuck_time: float = option(1.5, "a pull ends if the tip has hardly moved for so long", "s", "(0, inf)")

@@ -213,7 +213,8 @@ class _Run:
         try:
             with self._timed("looking"):
                 o, known = self.options, (self.driver, self.sight, self.camera)
-                seen = look(*known, o.points, self.rng, holding, force, dense, o.deviations)
+                pictures = 1 if holding else o.pictures
+                seen = look(*known, o.points, self.rng, holding, force, dense, o.deviations, pictures)
         except Ended as end:
             self.result.setdefault("seen", end.reason == Reason.NO_OBJECT)
             raise

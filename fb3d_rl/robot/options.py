@@ -21,6 +21,9 @@ class RobotOptions:
     trials: int = option(5, "trials of each object, each with a pose of its own", within="[1, inf)")
     noise: str = option("azure_kinect", "the depth camera's errors", among=PRESETS)
     without: list[str] = option([], "terms of these errors to leave out: " + ", ".join(TERMS))
+    pictures: int = option(
+        1, "pictures whose depth's median is taken before the arm moves, against noise", within="[1, inf)"
+    )
     calibration_deg: float | None = option(
         0.2,
         "turn by which the camera's calibration is off, about an axis drawn for the session",

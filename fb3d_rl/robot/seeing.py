@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -85,6 +86,7 @@ def look(
     force: Array | None = None,
     dense: bool = True,
     deviations: float = 2.0,
+    pictures: int = 1,
 ) -> Seen:
     """Take a picture and cut the object out.
 
@@ -98,12 +100,13 @@ def look(
         force: [3] N at the tip.
         dense: whether the dense cloud is wanted; else it is that of the pixels.
         deviations: beyond which a point is an outlier (:func:`~fb3d_rl.perception.foreground.object_points`).
+        pictures: taken one after the other while all stands still (see :func:`still_depth`).
 
     Raises:
         Ended: there is no picture, no depth or no object.
     """
     joints = driver.joints()
-    depth, lens = _checked(driver.picture())
+    depth, lens = still_depth([_checked(driver.picture()) for _ in range(pictures)])
     robot = on_robot(depth, sight.depth(joints.position, camera, lens, depth.shape), dilation=DILATION)
     cloud = _in_base(points_of(depth, lens, 1.0), camera)
     cloud[~_in_workspace(cloud)] = np.nan
@@ -128,6 +131,22 @@ def look(
         own[chosen].astype(np.float32), camera[:3, 3].copy(), tip, joints.position, TABLE, holding, felt
     )
     return Seen(whole, observation)
+
+
+def still_depth(
+    pictures: Sequence[tuple[NDArray[np.float32], Intrinsics]],
+) -> tuple[NDArray[np.float32], Intrinsics]:
+    """One depth image [H, W] (m) of several of the same scene: at each pixel the median of what was measured there.
+
+    A pixel that fewer than half of them measured is 0: single points that fly, and edges, are not kept.
+    """
+    (depth, lens), *others = pictures
+    if not others:
+        return depth, lens
+    measured = np.stack([depth, *(other for other, _ in others)])
+    measured[measured == 0.0] = np.nan
+    often = 2 * np.isfinite(measured).sum(0) >= len(measured)
+    return np.where(often, np.nanmedian(np.where(often, measured, 0.0), axis=0), 0.0).astype(np.float32), lens
 
 
 def _checked(picture: Picture | None) -> tuple[NDArray[np.float32], Intrinsics]:

@@ -131,6 +131,7 @@ def attempt_options(options: RobotOptions, learner: bool = False) -> AttemptOpti
         place=replace(defaults.place, rim=options.rim, margin=MARGIN, slant=SLANT if options.rim else 90.0),
         points=SEEN,
         grips=options.grips,
+        pictures=options.pictures,
         deviations=defaults.deviations if options.outliers else np.inf,
         look_every=LEARNER_LOOKS if learner else defaults.look_every,
     )

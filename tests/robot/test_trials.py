@@ -18,6 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.robot import evaluate_robot
+from fb3d_rl.perception.depth import Intrinsics
 from fb3d_rl.policies.baselines import random_policy
 from fb3d_rl.policies.flow_policy import FlowPolicy, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis
@@ -30,7 +31,7 @@ from fb3d_rl.robot.objects import TABLE_I
 from fb3d_rl.robot.options import RobotOptions
 from fb3d_rl.robot.policy_flow import Frame, PolicyFlow, asking, observed
 from fb3d_rl.robot.rows import RobotRow
-from fb3d_rl.robot.seeing import smoothed
+from fb3d_rl.robot.seeing import smoothed, still_depth
 from fb3d_rl.robot.trials import RobotTrial, blank_rows, key_of, run_trials, schedule, session_of
 
 Array = NDArray[np.float64]
@@ -259,6 +260,29 @@ def test_the_expert_is_the_truth_and_a_policy_without_flow_is_refused() -> None:
     assert np.array_equal(PolicyFlow.of_policy(expert_policy(LIMITS), lambda points: truth)(seen), truth)
     with pytest.raises(UserError, match="policies of a flow"):
         PolicyFlow.of_policy(random_policy(LIMITS), lambda points: truth)
+
+
+def test_what_no_robot_can_follow_is_refused_before_any_trial(tmp_path: Path) -> None:
+    both = {"expert": expert_policy(LIMITS), "random": random_policy(LIMITS)}
+    with pytest.raises(UserError, match="policies of a flow"):
+        evaluate_robot(tmp_path, both, OPTIONS, 0, None, 1, False, {})
+    with pytest.raises(UserError, match="the arm ur5 is unknown"):
+        evaluate_robot(tmp_path, {"expert": both["expert"]}, replace(OPTIONS, arm="ur5"), 0, None, 1, False, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_median_of_several_pictures_has_less_noise_and_no_points_that_fly() -> None:
+    rng, lens = np.random.default_rng(0), Intrinsics(500.0, 500.0, 32.0, 24.0)
+    shots = []
+    for _ in range(9):
+        depth = (1.0 + 0.006 * rng.standard_normal((48, 64))).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.1] = 0.0  # holes now and then
+        depth[:, :4] = np.where(rng.random((48, 4)) < 0.2, 0.7, 0.0)  # seldom measured, and wrong
+        shots.append((depth, lens))
+    depth, kept = still_depth(shots)
+    assert kept is lens and (depth[:, :4] == 0).mean() > 0.95 and (depth[:, 4:] > 0).mean() > 0.99
+    assert depth[:, 4:][depth[:, 4:] > 0].std() < 0.006 / 2
+    assert still_depth(shots[:1])[0] is shots[0][0]
 
 
 # -------------------------------------------------------------------------------------------------------- crashes
