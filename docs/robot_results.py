@@ -15,7 +15,7 @@ TRIALS = {
     "ArtFlowNet without mask, all errors (.2 degrees, 2 mm)": "artflownet",
     "the same with one grip and each point's most probable flow": "artflownet_one_grip",
     "DAgger Oracle, all errors": "dagger_oracle",
-    "surface normal, all errors": "normal",
+    "surface normal (told the part by a mask), all errors": "normal",
     "random, all errors": "random",
 }
 """Folders of 70 trials."""
@@ -35,7 +35,8 @@ ABLATIONS = {
     "without `dark`": "no_dark",
     "without `rounding`": "no_rounding",
     "without `limits`": "no_limits",
-    "the stereo camera's errors": "stereo",
+    "the stereo camera's errors (`robot.noise=stereo`)": "stereo",
+    "the same, the median of nine pictures (`robot.pictures=9`)": "stereo9",
     "exact force": "noforce",
     "`robot.rim=false`: the supplement's contact heuristic alone": "rim",
     "`robot.outliers=false`": "outliers",
