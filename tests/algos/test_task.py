@@ -18,7 +18,7 @@ from fb3d_rl.algos.dagger import BUFFER
 from fb3d_rl.algos.run import run_training
 from fb3d_rl.algos.task import load_learner
 from fb3d_rl.algos.weights import CHECKPOINT
-from fb3d_rl.data import maniskill
+from fb3d_rl.data import lerobot, maniskill
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.env.any_task import make_task
 from fb3d_rl.errors import UserError
@@ -78,6 +78,12 @@ def test_rounds_labels_and_the_same_bits(tmp_path: Path, config: Config) -> None
     acted = load_learner(again / CHECKPOINT)(shown.clone())["action"]
     assert torch.equal(learner(shown.clone())["action"], acted), "the checkpoint is the whole learner"
     maniskill.write(buffer, tmp_path / "x.h5")  # what others read
+    lerobot.write(buffer, tmp_path / "lerobot", rate=20)
+    for read, source in ((maniskill.read, tmp_path / "x.h5"), (lerobot.read, tmp_path / "lerobot")):
+        copy = read(source, tmp_path / read.__module__)
+        assert copy.episodes == buffer.episodes and len(copy) == 100
+        whole = torch.arange(100)
+        assert bool((copy[whole] == buffer[whole]).all()), "and they come back in every bit"
 
 
 def test_an_episode_does_not_depend_on_those_before_it() -> None:
