@@ -207,7 +207,7 @@ def imitation_partnet_mobility() -> Lines:
 
 
 GUIDED = (
-    ("as above", "plain"),
+    ("default", "plain"),
     ("`focus=part`", "part"),
     ("`contact=true phase=true`", "guided"),
     ("`contact=true phase=true focus=part`", "guided_part"),
