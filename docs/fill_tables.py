@@ -208,6 +208,34 @@ def imitation_partnet_mobility() -> Lines:
     })  # fmt: skip
 
 
+GUIDED = (
+    ("default", "plain"),
+    ("`focus=part`", "part"),
+    ("`contact=true phase=true`", "guided"),
+    ("`contact=true phase=true focus=part`", "guided_part"),
+    ("`encoder=artflownet`", "artflownet"),
+)
+"""Options of algo.learner and the folders of their runs, which end with a seed."""
+
+
+def imitation_contact() -> Lines:
+    """What helps a learner with few labels to get to the part; a line for each option and seed."""
+    below = "imitation_contact"
+    rows = [
+        Row(f"{label}, seed {seed}", f"{name}_{seed}", "dagger")
+        for label, name in GUIDED
+        for seed in (0, 1)
+        if (RESULTS / below / f"{name}_{seed}").is_dir()
+    ]
+    return trials(rows, {
+        "trials": lambda row: str(summary(f"{below}/{row.folder}")["n"]),
+        "contact, seen categories": share("contact_rate", below, "train_test"),
+        "contact, unseen ones": share("contact_rate", below, "test"),
+        "contact": share("contact_rate", below),
+        "success": share("success_rate", below),
+    })  # fmt: skip
+
+
 def comparison() -> Lines:
     """Every policy on the same trials, by split."""
     below = "comparison"
@@ -421,7 +449,8 @@ def learning_curve_seeds() -> Lines:
 TABLES: dict[str, Callable[[], Lines]] = {
     function.__name__: function
     for function in (
-        headline, imitation, imitation_unseen, imitation_partnet_mobility, comparison, procedural, partnet_mobility,
+        headline, imitation, imitation_unseen, imitation_partnet_mobility, imitation_contact, comparison,
+        procedural, partnet_mobility,
         flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
         learning_curve_seeds, robot, robot_ablation,
     )

@@ -193,15 +193,19 @@ def _validate_task(cfg: CommandConfig) -> None:
     algo = cfg.algo
     if not isinstance(algo, ImitationOptions):
         raise UserError(f"algo={algo.name} opens parts; on env.task={cfg.env.task} choose algo=bc or algo=dagger")
+    if algo.learner.encoder == "artflownet":
+        raise UserError(f"algo.learner.encoder=artflownet has seen objects that open, not env.task={cfg.env.task}")
     for key, value, wanted in (
         ("algo.gate.name", algo.gate.name, "beta"),
         ("algo.members", algo.members, 1),
         ("algo.oracle", algo.oracle, False),
         ("algo.learner.flow", algo.learner.flow, "none"),
+        ("algo.learner.focus", algo.learner.focus, "none"),
+        ("algo.learner.contact", algo.learner.contact, False),
+        ("algo.learner.phase", algo.learner.phase, False),
         ("algo.demonstrations", algo.demonstrations, None),
         ("algo.overlap", algo.overlap, False),
         ("algo.validate_trials", algo.validate_trials, 0),
-        ("resume", cfg.resume, False),
     ):
         if value != wanted:
             said = "null" if wanted is None else str(wanted).lower()
@@ -263,6 +267,8 @@ def _validate_imitation(algo: ImitationOptions, collector: CollectorOptions, lab
         raise UserError(
             "algo.learner.flow=artflownet and algo.flow_checkpoint=PATH, a checkpoint of algo=artflownet, go together"
         )
+    if learner.encoder != "artflownet" and not learner.frozen:
+        raise UserError("algo.learner.frozen=false trains the weights of algo.learner.encoder=artflownet")
     if algo.overlap and collector.backend == "direct":
         raise UserError("algo.overlap=true collects beside the fit; choose collector=process or collector=ray")
 

@@ -6,17 +6,19 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
 
+from fb3d_rl.algos.weights import CHECKPOINT
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
-from fb3d_rl.policies.learner import OBSERVED, hand_features, history_of, twist_of
+from fb3d_rl.policies.learner import INTENTION, OBSERVED, hand_features, history_of, twist_of
 from fb3d_rl.rollout import demonstrations
 from fb3d_rl.rollout.collectors import Workers
 from fb3d_rl.rollout.demonstrations import episode_info
@@ -151,6 +153,7 @@ class RowsOptions:
         flow: the key of the flow in the learner's input, if there is one.
         further: what a gate compares and remembers, and keys from which its thresholds are set.
         attached_only: whether only steps in which suction holds a part become rows.
+        guided: whether a row holds the expert's intention, which the learner learns to tell.
     """
 
     limits: VelocityLimits
@@ -158,10 +161,12 @@ class RowsOptions:
     flow: Key | None = None
     further: tuple[Key, ...] = ()
     attached_only: bool = False
+    guided: bool = False
 
     def keys(self) -> list[Key]:
         """The keys that the workers have to send."""
-        return [*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME]
+        told = [("next", "policy", key) for key in INTENTION] if self.guided else []
+        return [*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME, *told]
 
     def why_none(self, ended: int, error: str) -> str:
         """Why the trials of a round, of which ``ended`` did not crash, gave no rows, and what to change."""
@@ -175,6 +180,9 @@ class RowsOptions:
     def of(self, frames: TensorDictBase) -> TensorDictBase:
         """The rows of an episode's frames [T], with the label as a twist and the hand's earlier steps."""
         rows = frames.select(*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further)
+        for key in INTENTION if self.guided else ():
+            kept = ("expert", key)  # of demonstrations that another run collected
+            rows[kept] = frames[kept] if kept in frames.keys(True) else frames["next", "policy", key]
         rows["expert", "twist"] = twist_of(rows["observation"], rows["expert", "action"], self.limits)
         if self.history:
             rows["learner", "felt"] = history_of(hand_features(rows["observation"], self.limits), self.history)
@@ -190,10 +198,31 @@ def copy_demonstrations(source: DemonstrationBuffer, target: DemonstrationBuffer
     lacking = [key for key in (*OBSERVED, *([rows.flow] if rows.flow else ()), *EXPERT) if key not in source.keys]
     if lacking:
         raise UserError(f"the demonstrations at {source.path} lack {', '.join(map(str, lacking))}; record them anew")
+    if rows.guided and any(("expert", key) not in source.keys for key in INTENTION):
+        raise UserError(
+            f"the demonstrations at {source.path} do not say where the expert was going, as only the buffer of a run "
+            "with algo.learner.contact or algo.learner.phase does: leave both false"
+        )
     for episode, info in enumerate(source.episodes):
         frames = source.frames(episode)
         kept = rows.of(frames).update(frames.select("record", strict=False))
         target.extend(recorded(kept, info, beta=1.0, version=-1), info)
+
+
+def kept_buffer(path: Path, rows: int) -> DemonstrationBuffer:
+    """The buffer of a run that is resumed, cut to the rows that its checkpoint counts.
+
+    Raises:
+        UserError: it has fewer.
+    """
+    buffer = DemonstrationBuffer.open(path)
+    if len(buffer) < rows:
+        raise UserError(
+            f"{path} holds {len(buffer)} of the {rows} rows that {CHECKPOINT} counts; copy the run folder anew, or "
+            "start a new run"
+        )
+    buffer.truncate(rows)
+    return buffer
 
 
 def relabelled(rows: TensorDictBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:

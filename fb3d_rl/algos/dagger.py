@@ -22,7 +22,15 @@ from torch import Tensor
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.algorithm import Acting
-from fb3d_rl.algos.collection import Round, RowsOptions, collect, copy_demonstrations, expert_share, relabelled
+from fb3d_rl.algos.collection import (
+    Round,
+    RowsOptions,
+    collect,
+    copy_demonstrations,
+    expert_share,
+    kept_buffer,
+    relabelled,
+)
 from fb3d_rl.algos.learners import (
     Labels,
     acting_policy,
@@ -95,6 +103,10 @@ class Progression:
     learner: dict[str, Tensor] = field(default_factory=dict)
     gate: dict[str, Tensor] = field(default_factory=dict)
 
+    def as_dict(self) -> dict[str, Any]:
+        """The entries by name; tensors are not copied."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
 
 class Run:
     """A run of algo=bc or algo=dagger.
@@ -141,7 +153,7 @@ class Run:
             self.save()
         else:
             self.done = self.restored(saved["state"]["run"])
-            self.buffer = self.kept_buffer()
+            self.buffer = kept_buffer(out / BUFFER, self.done.rows)
 
     def new_buffer(self, given: DemonstrationBuffer | None) -> DemonstrationBuffer:
         """A buffer for the run's labels that starts with the given demonstrations."""
@@ -168,21 +180,6 @@ class Run:
                 check_state(networks(self.learner), options, done.fit)
         return done
 
-    def kept_buffer(self) -> DemonstrationBuffer:
-        """The buffer, cut to the rows that the checkpoint counts.
-
-        Raises:
-            UserError: it has fewer.
-        """
-        buffer, rows = DemonstrationBuffer.open(self.out / BUFFER), self.done.rows
-        if len(buffer) < rows:
-            raise UserError(
-                f"{self.out / BUFFER} holds {len(buffer)} of the {rows} rows that {CHECKPOINT} counts; "
-                "copy the run folder anew, or start a new run"
-            )
-        buffer.truncate(rows)
-        return buffer
-
     def save(self) -> None:
         """Write the checkpoint."""
         done, weights, flow_net = self.done, networks(self.learner).state_dict(), flow_network(self.learner)
@@ -190,7 +187,7 @@ class Run:
             done.learner = {key: value.clone() for key, value in weights.items()}
         done.gate = self.policy.gate.state_dict()
         state = {
-            "run": {item.name: getattr(done, item.name) for item in fields(done)},
+            "run": done.as_dict(),
             "model": weights,
             "flow_model": None if flow_net is None else flow_net.state_dict(),
             "step": done.round,
@@ -381,7 +378,8 @@ def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> 
     compared = [key for key in gate.in_keys if key[0] == "learner"]
     draws: list[Key] = ["seed"] if algo.learner.draws and algo.gate.budget is not None else []
     further = tuple(dict.fromkeys([*state, *compared, *draws]))
-    return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], further, algo.oracle)
+    return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], further, algo.oracle,
+                       algo.learner.guided)  # fmt: skip
 
 
 def fit_options(algo: ImitationOptions, labels: int, seed: int, number: int) -> FitOptions:

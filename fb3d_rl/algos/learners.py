@@ -15,12 +15,13 @@ from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.data.picking import Index, pick
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.artflownet import ArtFlowNet
+from fb3d_rl.models.guide import Intention
 from fb3d_rl.policies.ensemble import Ensemble
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
-from fb3d_rl.policies.learner import INPUTS, Learner, rotated
+from fb3d_rl.policies.learner import INPUTS, Learner, intention_of, rotated, turning
 from fb3d_rl.policies.options import LearnerOptions
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.draws import generator, global_draws
@@ -154,6 +155,29 @@ def learner_options(algo: ImitationOptions) -> LearnerOptions:
     return replace(algo.learner, discrepancy=PREDICTED in new_gate(algo).in_keys)
 
 
+def _guided(member: Learner, inputs: TensorDictBase, rows: TensorDictBase, matrix: Tensor) -> tuple[Intention, Tensor]:
+    """The intention for which the head learns to plan, and the loss of what the guide tells.
+
+    The head is given the expert's own intention, of which it learns how to follow it; where the expert goes to no
+    contact point, what the guide tells.
+
+    Args:
+        member: the learner.
+        inputs: its network's inputs in a scene that was turned by ``matrix`` [B, 3, 3].
+        rows: the rows [B].
+        matrix: see above.
+    """
+    told, (true, goes) = member.network.told(inputs), intention_of(rows)
+    contact, standoff = (torch.einsum("bij,bj->bi", matrix, vector) for vector in (true.contact, true.standoff))
+    true, own = Intention(contact, standoff, true.phase), told.intention()
+    contact, standoff = (
+        torch.where(goes[:, None], one, other)
+        for one, other in ((true.contact, own.contact), (true.standoff, own.standoff))
+    )
+    loss = told.loss(true, goes, member.options.contact, member.options.phase)
+    return Intention(contact, standoff, true.phase), loss
+
+
 def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, seed: int) -> Objective:
     """The loss of every member's head on inputs that are rotated and mirrored at random.
 
@@ -170,7 +194,11 @@ def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, see
             draws = torch.rand(2, len(rows), generator=generator(own, TURN, step)).to(rows.device)
             mirrored = (draws[1] < 0.5) & algo.mirror
             inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * largest, mirrored)
-            encoded, _ = member.network(*(inputs[key] for key in INPUTS))
+            intention = None
+            if member.options.guided:
+                intention, value = _guided(member, inputs, rows, turning((2 * draws[0] - 1) * largest, mirrored))
+                values.append(algo.auxiliary * value)
+            encoded, _ = member.network(*(inputs[key] for key in INPUTS), intention)
             twist = twist.masked_fill(rows["is_pad"][..., None], 0.0)
             batch = {"encoded": encoded, "twist": twist, "is_pad": rows["is_pad"]}
             with global_draws(generator(own, NOISE, step), twist.device):

@@ -107,5 +107,8 @@ class ImitationOptions(OptimizerOptions, AlgoOptions):
     )
     loss: Literal["l1", "l2", "smooth_l1"] = option("l1", "loss of a deterministic head; the others have their own")
     kl_weight: float = option(10.0, "of head=act: weight of its latent's divergence from a normal", within="[0, inf)")
+    auxiliary: float = option(
+        0.1, "weight of the loss of what learner.contact and learner.phase tell", within="[0, inf)"
+    )
     turn: float = option(15.0, "inputs are rotated about z by a random angle of at most this", "degrees", "[0, inf)")
     mirror: bool = option(True, "mirror inputs with probability 1/2")

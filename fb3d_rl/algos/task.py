@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -23,10 +24,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from fb3d_rl.algos import setup
-from fb3d_rl.algos.collection import expert_share
-from fb3d_rl.algos.dagger import BUFFER, fit_options, round_beta, share
+from fb3d_rl.algos.collection import expert_share, kept_buffer
+from fb3d_rl.algos.dagger import BUFFER, Progression, fit_options, round_beta, share
 from fb3d_rl.algos.learners import NOISE, Labels, drawn_rows
-from fb3d_rl.algos.weights import CHECKPOINT
+from fb3d_rl.algos.weights import CHECKPOINT, state_before
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded
 from fb3d_rl.env.any_task import make_task
@@ -43,7 +44,9 @@ from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoin
 from fb3d_rl.training.draws import generator, global_draws
 from fb3d_rl.training.fit import fit
 from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.options import FitOptions
 from fb3d_rl.training.run_log import RunLog, open_logger
+from fb3d_rl.training.state import check_state
 
 if TYPE_CHECKING:
     from fb3d_rl.algos.options import ImitationOptions
@@ -66,49 +69,117 @@ def train_on_task(cfg: TrainConfig, out: Path) -> dict[str, Any]:
         UserError: task or expert cannot be used.
     """
     setup.require_simulator(otherwise="train where it is installed")
-    algo, env = cast("ImitationOptions", cfg.algo), cfg.env
-    assert env.task is not None and cfg.expert.target is not None
-    make = partial(
-        make_task, env.task, cfg.expert.target, str(Path.cwd()), env.sees, cfg.data.points, dict(env.task_options)
-    )
-    first = make()  # what cannot be is said before any work
-    sizes = (first.observation_spec[STATE].shape[-1], first.action_spec.shape[-1], env.sees == "points")
-    first.close()
-    learner = TaskLearner(algo.learner, *sizes, torch.Generator().manual_seed(cfg.seed)).eval()
-    gate = BetaGate(per_step=algo.beta.mixing == "step")
-    both = TaskInteraction(cast(Any, TaskExpert()), learner, gate)
-    buffer = DemonstrationBuffer.create(out / BUFFER, cfg.data.labels, {"task": env.task, "control_mode": None})
-    steps, device = 0, setup.choose_device(cfg.device)
-    with RunLog(out, logger=open_logger(cfg.logger.name, cfg.logger.project, out)) as log:
-        with Workers(partial(_env, make, state_of(both)), both, setup.collector_options(cfg), env.horizon) as workers:
-            for number in range(algo.rounds):
-                gate.beta.fill_(round_beta(algo, number))
-                workers.update_policy_weights_()
-                numbers = _collect(workers, buffer, learner, algo, share(cfg.data.labels, algo.rounds, number), number,
-                                   cfg.seed, env.task)  # fmt: skip
-                if number == 0:
-                    rows = [buffer.frames(i) for i in range(len(buffer.episodes))]
-                    learner.network.measure(*(torch.cat([row[key] for row in rows])
-                                              for key in (STATE, ("expert", "twist"))))  # fmt: skip
-                options = fit_options(algo, cfg.data.labels, cfg.seed, number)
-                labels = Labels(buffer, algo.learner.chunk, drawn_rows(buffer, algo.sampling, number))
-                fit(learner.network.to(device), labels, options, objective=objective(learner, algo, options.seed),
-                    device=device, title=f"round {number + 1} of {algo.rounds}: fit",
-                    log=partial(_log_fit, log, steps, number))  # fmt: skip
-                learner.network.to("cpu")
-                steps += options.steps
-                log.write({"step": steps, "round": number, "labels": len(buffer), "beta": round_beta(algo, number),
-                           **numbers})  # fmt: skip
-                save_checkpoint(
-                    out / CHECKPOINT, algo=algo.name, config=content(cfg), seed=cfg.seed,
-                    model_kwargs={"options": asdict(algo.learner), "sizes": list(sizes), "task": env.task},
-                    state={"model": learner.network.state_dict(), "step": number + 1},
-                )  # fmt: skip
-    rows = [buffer.frames(i) for i in range(len(buffer.episodes))]
+    run = TaskRun(cfg, out)
+    run.train()
+    rows = [run.buffer.frames(i) for i in range(len(run.buffer.episodes))]
     known = setup.facts(cfg)
     del known["assets"]
-    facts = known | {"task": env.task, "labels": len(buffer), "expert_share": expert_share(rows)}
-    return _evaluate(cfg, out, make, {"expert": TaskExpert(), algo.name: learner}, facts)
+    facts = known | {"task": cfg.env.task, "labels": len(run.buffer), "expert_share": expert_share(rows)}
+    return _evaluate(cfg, out, run.make, {"expert": TaskExpert(), run.algo.name: run.learner}, facts)
+
+
+class TaskRun:
+    """A run on a task of ManiSkill; with ``resume`` it goes on from its checkpoint.
+
+    Args:
+        cfg: the configuration.
+        out: the run folder.
+
+    Raises:
+        UserError: task or expert cannot be used, or checkpoint and buffer do not fit; raised before any work.
+    """
+
+    def __init__(self, cfg: TrainConfig, out: Path) -> None:
+        self.cfg, self.out, self.algo = cfg, out, cast("ImitationOptions", cfg.algo)
+        env = cfg.env
+        assert env.task is not None and cfg.expert.target is not None
+        self.task = env.task
+        self.make = partial(
+            make_task, env.task, cfg.expert.target, str(Path.cwd()), env.sees, cfg.data.points, dict(env.task_options)
+        )
+        first = self.make()  # what cannot be is said before any work
+        self.sizes = (first.observation_spec[STATE].shape[-1], first.action_spec.shape[-1], env.sees == "points")
+        first.close()
+        self.learner = TaskLearner(self.algo.learner, *self.sizes, torch.Generator().manual_seed(cfg.seed)).eval()
+        self.gate = BetaGate(per_step=self.algo.beta.mixing == "step")
+        self.device = setup.choose_device(cfg.device)
+        saved = state_before(cfg, out)
+        self.resumed = saved is not None
+        if saved is None:
+            self.done = Progression()
+            if cfg.resume:
+                shutil.rmtree(out / BUFFER, ignore_errors=True)
+            about = {"task": env.task, "control_mode": None}
+            self.buffer = DemonstrationBuffer.create(out / BUFFER, cfg.data.labels, about)
+            self.save()
+            return
+        with fitting(out / CHECKPOINT):
+            self.done = Progression(**saved["state"]["run"])
+            self.learner.network.load_state_dict(self.done.learner)
+            if self.done.fit is not None:
+                check_state(self.learner.network, self.options(self.done.round), self.done.fit)
+        self.buffer = kept_buffer(out / BUFFER, self.done.rows)
+
+    def options(self, number: int) -> FitOptions:
+        """How the learner is fitted in a round."""
+        return fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, number)
+
+    def save(self) -> None:
+        """Write the checkpoint."""
+        done, weights = self.done, self.learner.network.state_dict()
+        if done.fit is None:
+            done.learner = {key: value.clone() for key, value in weights.items()}
+        save_checkpoint(
+            self.out / CHECKPOINT, algo=self.algo.name, config=content(self.cfg), seed=self.cfg.seed,
+            model_kwargs={"options": asdict(self.algo.learner), "sizes": list(self.sizes), "task": self.task},
+            state={"model": weights, "step": done.round, "run": done.as_dict()},
+        )  # fmt: skip
+
+    def train(self) -> None:
+        """Run the rounds that are left."""
+        cfg, algo, done = self.cfg, self.algo, self.done
+        both = TaskInteraction(cast(Any, TaskExpert()), self.learner, self.gate)
+        create, options = partial(_env, self.make, state_of(both)), setup.collector_options(cfg)
+        kept = done.log_rows if self.resumed else None
+        with RunLog(
+            self.out, resume_rows=kept, logger=open_logger(cfg.logger.name, cfg.logger.project, self.out)
+        ) as log:
+            with Workers(create, both, options, cfg.env.horizon) as workers:
+                while done.round < algo.rounds:
+                    number = done.round
+                    if done.collected == number:
+                        self.gate.beta.fill_(round_beta(algo, number))
+                        workers.update_policy_weights_()
+                        labels = share(cfg.data.labels, algo.rounds, number)
+                        done.numbers = _collect(workers, self.buffer, self.learner, algo, labels, number, cfg.seed,
+                                                self.task)  # fmt: skip
+                        done.rows, done.collected = len(self.buffer), number + 1
+                        self.save()
+                    self.fit(number, log)
+                    steps = sum(self.options(i).steps for i in range(number + 1))
+                    log.write({"step": steps, "round": number, "labels": len(self.buffer),
+                               "beta": round_beta(algo, number), **done.numbers})  # fmt: skip
+                    done.round, done.fit, done.numbers, done.log_rows = number + 1, None, {}, log.rows
+                    self.save()
+
+    def fit(self, number: int, log: RunLog) -> None:
+        """Fit the learner to the labels of the rounds so far; checkpoints are saved meanwhile."""
+        algo, done, network, options = self.algo, self.done, self.learner.network, self.options(number)
+        before = sum(self.options(i).steps for i in range(number))
+
+        def checkpoint(state: dict[str, Any]) -> None:
+            done.fit, done.log_rows = state, log.rows
+            self.save()
+
+        if number == 0:
+            rows = [self.buffer.frames(i) for i in range(len(self.buffer.episodes))]
+            network.measure(*(torch.cat([row[key] for row in rows]) for key in (STATE, ("expert", "twist"))))
+        labels = Labels(self.buffer, algo.learner.chunk, drawn_rows(self.buffer, algo.sampling, number))
+        fit(network.to(self.device), labels, options, objective=objective(self.learner, algo, options.seed),
+            device=self.device, title=f"round {number + 1} of {algo.rounds}: fit", on_checkpoint=checkpoint,
+            resume=done.fit, log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
+            )  # fmt: skip
+        network.to("cpu")
 
 
 def load_learner(path: str | Path) -> TaskLearner:
@@ -144,10 +215,6 @@ def objective(learner: TaskLearner, algo: ImitationOptions, seed: int) -> Object
 
 def _env(make: partial[EnvBase], state: TensorDict) -> EnvBase:
     return policy_env(make(), state)
-
-
-def _log_fit(log: RunLog, before: int, number: int, row: dict[str, Any]) -> None:
-    log.write({**row, "step": before + row["step"], "round": number})
 
 
 def _collect(

@@ -281,19 +281,22 @@ def new_buffer(path: Path | str, capacity: int, about: Mapping[str, Any]) -> Ite
 def demonstrated(frames: TensorDictBase) -> TensorDictBase:
     """Frames [T] of foreign data with the keys that they lack; the expert counts as acting in every step.
 
+    Frames of another task of ManiSkill, which have a "state" among what is observed, may have any observation.
+
     Raises:
         UserError: the observation or the action is not what the data contract says, there is no step, a number is not
             finite, or an action is out of range.
     """
     if not len(frames):
         raise UserError("the data do not fit the task: an episode has no step; leave it out")
-    if ("observation", "goal_sense") not in frames.keys(include_nested=True):
-        frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # without a goal the task is to open
-    try:
-        contract.check(frames, "observation")
-        contract.check(frames, "action")
-    except ValueError as error:
-        raise UserError(f"the data do not fit the task: {error}") from error
+    if ("observation", "state") not in frames.keys(include_nested=True):
+        if ("observation", "goal_sense") not in frames.keys(include_nested=True):
+            frames["observation", "goal_sense"] = torch.ones(len(frames), 1)  # without a goal the task is to open
+        try:
+            contract.check(frames, "observation")
+            contract.check(frames, "action")
+        except ValueError as error:
+            raise UserError(f"the data do not fit the task: {error}") from error
     _require_numbers(frames)
     steps = len(frames)
     labels: dict[Key, Tensor] = {

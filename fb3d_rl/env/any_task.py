@@ -125,7 +125,9 @@ def make_task(
 
     given = {"obs_mode": "state_dict", "render_backend": "none"} if sees == "state" else {"obs_mode": "pointcloud"}
     try:
-        env = gymnasium.make(task, **{**given, "num_envs": 1, "sim_backend": "physx_cpu", **options})
+        # Built anew for each episode: what an episode leaves behind, such as a grasp, is felt at the start of the next.
+        fixed = {"num_envs": 1, "sim_backend": "physx_cpu", "reconfiguration_freq": 1}
+        env = gymnasium.make(task, **{**given, **fixed, **options})
     except Exception as error:  # noqa: BLE001, of any task
         raise UserError(f"env.task={task} cannot be made: {said(error)}") from error
     space = env.action_space

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
+from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.models.pointnet2 import GlobalAbstraction, Level, SetAbstraction
 
 
@@ -89,6 +92,15 @@ class DP3Encoder(nn.Module):
         return self.out(torch.cat([self.project(local.amax(1)), self.felt(context)], dim=-1))
 
 
+def seen_from_tip(points: Tensor, scales: Sequence[float]) -> Tensor:
+    """Places [..., 3] relative to the tip (m) as a network can read them [..., 6 + number of scales]: itself, its
+    direction, and how near it is on each of the scales (m).
+    """
+    distance = points.norm(dim=-1, keepdim=True)
+    near = [torch.exp(-distance / scale) for scale in scales]
+    return torch.cat([points, points / (distance + 0.1), *near], dim=-1)
+
+
 class AttentionPointNet(nn.Module):
     """PointNet with attention: each head attends to one place in the cloud.
 
@@ -122,18 +134,20 @@ class AttentionPointNet(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
         """See the class."""
-        distance = points.norm(dim=-1, keepdim=True)
-        near = [torch.exp(-distance / scale) for scale in self.SCALES]
-        own = torch.cat([points, points / (distance + 0.1), *near, features], dim=-1)
+        return self.attend(points, features, valid, context)[0]
+
+    def attend(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
+        """The result, and the points' scores [B, heads, N], -1e9 for those that are not valid."""
+        own = torch.cat([seen_from_tip(points, self.SCALES), features], dim=-1)
         local = self.second(self._first(own).relu()).relu()
         # A product and max cost half of masked_fill and amax, whose gradients copy and compare the whole cloud.
         pooled = (local * valid[..., None].to(local.dtype)).max(1).values
         scene = self.scene(torch.cat([pooled, context], dim=-1))
         again = torch.relu(self.again(local) + self.told(scene)[:, None])
-        scores = self.score.weight @ again.mT
-        weight = scores.masked_fill(~valid[:, None], -1e9).softmax(-1)  # [B, heads, N]
+        scores = (self.score.weight @ again.mT).masked_fill(~valid[:, None], -1e9)
+        weight = scores.softmax(-1)  # [B, heads, N]
         attended = torch.cat([weight @ own, weight @ again], dim=-1)  # [B, heads, own + width]
-        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1))
+        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1)), scores
 
     def _first(self, own: Tensor) -> Tensor:
         """The first layer, with zeros up to a multiple of four inputs: else its gradient takes three times as long."""
@@ -141,10 +155,47 @@ class AttentionPointNet(nn.Module):
         return nn.functional.linear(pad(own), pad(self.first.weight), self.first.bias)
 
 
-ENCODERS: dict[str, type[PointNet | PointNet2Encoder | AttentionPointNet | DP3Encoder]] = {
+class ArtFlowNetEncoder(nn.Module):
+    """The published ArtFlowNet's features of each point, read with attention: who predicts flow has seen the part.
+
+    Its batch norm keeps the statistics that it was published with.
+
+    Args:
+        inputs, context, outputs, width: as of :class:`PointNet`; the first of the inputs is the part mask.
+
+    Shapes: as of :class:`PointNet`.
+    """
+
+    def __init__(self, inputs: int, context: int, outputs: int, width: int = 64) -> None:
+        super().__init__()
+        self.flow = ArtFlowNet.from_pretrained()
+        backbone = self.flow.network
+        last = cast(nn.Linear, backbone.head[-1])
+        backbone.outputs, backbone.head[-1] = last.in_features, nn.Identity()
+        self.attention = AttentionPointNet(inputs + last.in_features, context, outputs, width)
+        self._published = {name: value.clone() for name, value in self.flow.state_dict().items()}
+
+    def publish(self) -> None:
+        """Take the published weights again, after all weights were drawn at random."""
+        self.flow.load_state_dict(self._published)
+
+    def train(self, mode: bool = True) -> ArtFlowNetEncoder:
+        """As every module's, but for batch norm."""
+        super().train(mode)
+        self.flow.eval()
+        return self
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
+        """See :class:`PointNet`."""
+        seen = self.flow.per_point(points, valid, features[..., 0] > 0)
+        return self.attention(points, torch.cat([features, seen], dim=-1), valid, context)
+
+
+ENCODERS: dict[str, type[PointNet | PointNet2Encoder | AttentionPointNet | DP3Encoder | ArtFlowNetEncoder]] = {
     "pointnet": PointNet,
     "pointnet2": PointNet2Encoder,
     "attention": AttentionPointNet,
     "dp3": DP3Encoder,
+    "artflownet": ArtFlowNetEncoder,
 }
 """The encoders by name."""

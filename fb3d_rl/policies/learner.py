@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
@@ -10,7 +12,9 @@ from fb3d_rl.contract import Key
 from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
-from fb3d_rl.models.encoders import ENCODERS
+from fb3d_rl.models.encoders import ENCODERS, ArtFlowNetEncoder
+from fb3d_rl.models.guide import Guide, Intention, Told
+from fb3d_rl.policies.flow_state import APPROACH, PHASES, TRAVEL
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
 from fb3d_rl.policies.options import LearnerOptions
 from fb3d_rl.policies.plans import PlanNetwork, executed, plan_state, trial_noise
@@ -22,6 +26,9 @@ TWIST = 6
 HAND_FEATURES = 4 * 3 + 3
 """Numbers that describe the hand: its axis, its tip's velocity, the direction to the camera and its angular velocity,
 all in the world; held, force, height of the tip. They lie under the key "felt"."""
+
+HELD = 12
+"""Which of them says whether the part is held."""
 
 INPUTS = ("points", "features", "valid", "felt")
 """Entries of the network's input."""
@@ -67,13 +74,32 @@ class TwistNetwork(PlanNetwork):
         super().__init__(options, TWIST, alike=3)  # a velocity has one size, so that it turns with the scene
         outputs = self._head.inputs + int(options.discrepancy)
         inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
-        self.encoder = ENCODERS[options.encoder](inputs, HAND_FEATURES * (1 + options.history), outputs, options.width)
+        context, width = HAND_FEATURES * (1 + options.history), options.width
+        if options.guided:
+            self.guide = Guide(inputs, context, len(PHASES), width, options.contact, options.phase)
+            context += self.guide.size
+        self.encoder = ENCODERS[options.encoder](inputs, context, outputs, width)
 
-    def forward(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> tuple[Tensor, Tensor | None]:
-        """See the class; None where no discrepancy is asked for."""
-        raw = self.encoder(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
+    def forward(
+        self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor, intention: Intention | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """See the class; None where no discrepancy is asked for.
+
+        With a guide the plan is for ``intention``, or for what the guide tells unless that is given.
+        """
+        points, context = points.masked_fill(~valid[..., None], 0.0), felt.flatten(1)
+        if self.options.guided:
+            meant = intention or self.guide(points, features, valid, context).intention()
+            context = torch.cat([context, self.guide.words(meant, felt[:, 0, HELD, None])], dim=1)
+        raw = self.encoder(points, features, valid, context)
         distance = nn.functional.softplus(raw[:, -1:]) if self.options.discrepancy else None
         return raw[:, : self._head.inputs], distance
+
+    def told(self, inputs: TensorDictBase) -> Told:
+        """What the guide tells about :meth:`Learner.network_inputs`."""
+        points, features, valid, felt = (inputs[key] for key in INPUTS)
+        told: Told = self.guide(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
+        return told
 
 
 class Learner(Policy):
@@ -108,6 +134,9 @@ class Learner(Policy):
         self.network = TwistNetwork(options)
         if generator is not None:
             initialize(self.network, generator)
+        if isinstance(self.network.encoder, ArtFlowNetEncoder):
+            self.network.encoder.publish()
+            self.network.encoder.flow.requires_grad_(not options.frozen)
         if (flow_net is not None) != (options.flow == "artflownet"):
             raise ValueError('flow="artflownet" needs a flow network, and nothing else does')
         self.flow_network = None if flow_net is None else flow_net.requires_grad_(False).eval()
@@ -135,23 +164,39 @@ class Learner(Policy):
 
     def network_inputs(self, rows: TensorDictBase) -> TensorDict:
         """Inputs [B] of rows [B]: "points", "features", "valid" and "felt" [B, 1 + history, HAND_FEATURES]."""
-        obs, count = rows["observation"], self.options.points
+        obs = rows["observation"]
         tip = obs["tool_pose"][..., :3]
-        features = [obs["part_mask"][:, :count, None].to(tip.dtype)]
+        shown = self._shown(obs)
+        features = [shown(obs["part_mask"])[..., None].to(tip.dtype)]
         if self.flow_key is not None:
-            features.append(rows[self.flow_key][:, :count])
+            features.append(shown(rows[self.flow_key]))
         felt = hand_features(obs, self.limits)[:, None]
         if self.options.history:
             felt = torch.cat([felt, rows["learner", "felt"]], dim=1)
         return TensorDict(
             {
-                "points": obs["points"][:, :count] - tip[:, None],
+                "points": shown(obs["points"]) - tip[:, None],
                 "features": torch.cat(features, dim=-1),
-                "valid": obs["valid"][:, :count],
+                "valid": shown(obs["valid"]),
                 "felt": felt,
             },
             batch_size=rows.batch_size,
         )
+
+    def _shown(self, obs: TensorDictBase) -> Callable[[Tensor], Tensor]:
+        """What takes the points that the network reads from values [B, N, ...] of a cloud's points."""
+        count, focus = self.options.points, self.options.focus
+        if focus == "none":
+            return lambda values: values[:, :count]
+        if focus == "hand":
+            far = (obs["points"] - obs["tool_pose"][:, None, :3]).norm(dim=-1).masked_fill(~obs["valid"], torch.inf)
+        else:
+            far = (~(obs["part_mask"] & obs["valid"])).to(torch.float32)
+        half = far.argsort(dim=1, stable=True)[:, : count // 2]
+        rest = torch.arange(count - half.shape[1], device=half.device).clamp(max=far.shape[1] - 1)
+        index = torch.cat([half, rest.expand(len(half), -1)], dim=1)
+        rows = torch.arange(len(index), device=index.device)[:, None]
+        return lambda values: values[rows, index]
 
     def train(self, mode: bool = True) -> Learner:
         """As every module's, but a flow network stays as it is."""
@@ -208,6 +253,25 @@ def twist_of(obs: TensorDictBase, action: Tensor, limits: VelocityLimits) -> Ten
     return torch.cat([velocity / limits.linear, angular / limits.angular], dim=-1)
 
 
+INTENTION = ("contact_point", "standoff", "phase")
+"""What of the expert's state a row keeps below "expert" for a learner that tells its intention."""
+
+
+def intention_of(rows: TensorDictBase) -> tuple[Intention, Tensor]:
+    """The expert's intention in rows [B], and where it goes to a contact point [B] bool."""
+    expert, phase = rows["expert"], rows["expert", "phase"].flatten()
+    contact = expert["contact_point"] - rows["observation", "tool_pose"][..., :3]
+    one_hot = nn.functional.one_hot(phase, len(PHASES)).to(contact.dtype)
+    return Intention(contact, expert["standoff"], one_hot), (phase == TRAVEL) | (phase == APPROACH)
+
+
+def turning(rotation: Tensor, mirrored: Tensor) -> Tensor:
+    """Matrices [B, 3, 3] that reflect in the plane y = 0 where ``mirrored`` [B], then turn about z by [B] rad."""
+    cos, sin, flip = rotation.cos(), rotation.sin(), torch.where(mirrored, -1.0, 1.0)
+    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
+    return torch.stack([cos, -sin * flip, zero, sin, cos * flip, zero, zero, zero, one], -1).view(-1, 3, 3)
+
+
 def rotated(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: Tensor) -> tuple[TensorDict, Tensor]:
     """The same situation in a scene that is reflected in the plane y = 0 where ``mirrored``, then turned about z.
 
@@ -219,9 +283,7 @@ def rotated(inputs: TensorDictBase, twist: Tensor, rotation: Tensor, mirrored: T
         rotation: [B] rad.
         mirrored: [B] bool.
     """
-    cos, sin, flip = rotation.cos(), rotation.sin(), torch.where(mirrored, -1.0, 1.0)
-    zero, one = torch.zeros_like(cos), torch.ones_like(cos)
-    matrix = torch.stack([cos, -sin * flip, zero, sin, cos * flip, zero, zero, zero, one], -1).view(-1, 3, 3)
+    matrix, flip = turning(rotation, mirrored), torch.where(mirrored, -1.0, 1.0)
 
     def turn(vectors: Tensor) -> Tensor:  # [B, K, 3]
         return vectors @ matrix.mT

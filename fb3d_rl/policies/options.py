@@ -277,8 +277,8 @@ class LearnerOptions:
         discrepancy: whether it also predicts its distance from the expert, which some gates ask for.
     """
 
-    encoder: Literal["attention", "pointnet", "pointnet2", "dp3"] = option(
-        "attention", "of the cloud; dp3 is that of 3D Diffusion Policy"
+    encoder: Literal["attention", "pointnet", "pointnet2", "dp3", "artflownet"] = option(
+        "attention", "of the cloud; dp3 is that of 3D Diffusion Policy, artflownet the published flow network"
     )
     head: Literal["deterministic", "gaussian", "mixture", "act", "diffusion", "flow_matching"] = option(
         "deterministic", "how a plan is made, see fb3d_rl.models.heads"
@@ -312,7 +312,26 @@ class LearnerOptions:
         "round; null: for the heads act, diffusion and flow_matching, which compare them with unit noise",
         later=True,
     )
+    focus: Literal["none", "hand", "part"] = option(
+        "none",
+        "half of the points that it reads are those nearest to the hand, or points of the part to open; none: all of "
+        "them are drawn evenly",
+        later=True,
+    )
+    contact: bool = option(
+        False,
+        "whether it also learns to tell the expert's contact point, as a score for each point of the cloud, and from "
+        "which side the hand comes; it plans for what it tells",
+        later=True,
+    )
+    phase: bool = option(False, "likewise the expert's phase: on its way, approaching, pulling ...", later=True)
+    frozen: bool = option(True, "whether encoder=artflownet keeps its published weights", later=True)
     discrepancy: bool = False
+
+    @property
+    def guided(self) -> bool:
+        """Whether it tells what the expert is about to do."""
+        return self.contact or self.phase
 
     @property
     def draws(self) -> bool:

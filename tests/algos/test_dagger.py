@@ -26,6 +26,7 @@ from fb3d_rl.algos.run import run_training as run
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.errors import UserError
+from fb3d_rl.policies.flow_state import APPROACH, TRAVEL
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import twist_of
 from fb3d_rl.rollout.collectors import Episode
@@ -281,6 +282,31 @@ def test_collection_beside_the_fit_repeats(tmp_path: Path, train: Train) -> None
     assert all(row["time/waited_for_training"] >= 0 for row in rounds[:-1])
 
 
+def test_a_guided_run_keeps_where_the_expert_was_going(tmp_path: Path, train: Train) -> None:
+    guided = ["algo.learner.contact=true", "algo.learner.phase=true", "algo.learner.focus=hand", "evaluation.trials=0",
+              "algo.validate_trials=0"]  # fmt: skip
+    buffer = DemonstrationBuffer.open(train(tmp_path / "one", *guided) / BUFFER)
+    for i, info in enumerate(buffer.episodes):
+        frames = buffer.frames(i)
+        expert, tip = frames["expert"], frames["observation", "tool_pose"][:, :3]
+        travels, approaches = (expert["phase"].flatten() == phase for phase in (TRAVEL, APPROACH))
+        assert bool(travels[0]) and torch.allclose(expert["standoff"].norm(dim=-1), torch.ones(len(frames)))
+        part = frames["observation", "points"][0][frames["observation", "part_mask"][0]]
+        near = torch.cdist(expert["contact_point"][travels | approaches], part).amin(1)
+        assert bool((near < 0.01).all()), "on the part"
+        if info.round == 0:  # the expert acts
+            ahead = ((tip - expert["contact_point"]) * expert["standoff"]).sum(-1)
+            assert bool((ahead[approaches].diff() < 0.01).all()), "and comes nearer"
+    again = train(tmp_path / "two", *guided, "algo.rounds=1", f"algo.demonstrations={tmp_path / 'one' / BUFFER}")
+    copied = DemonstrationBuffer.open(again / BUFFER)
+    assert torch.equal(copied.frames(0)["expert", "contact_point"], buffer.frames(0)["expert", "contact_point"])
+
+
+def test_demonstrations_that_do_not_say_where_the_expert_goes(first: Path, tmp_path: Path, train: Train) -> None:
+    with pytest.raises(UserError, match="do not say where the expert was going"):
+        train(tmp_path, "algo.learner.phase=true", f"algo.demonstrations={first / BUFFER}")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "overrides",
@@ -295,7 +321,8 @@ def test_collection_beside_the_fit_repeats(tmp_path: Path, train: Train) -> None
         ["algo=safe_dagger", "algo.learner.head=flow_matching", "algo.learner.normalize=false"],
         ["algo=dagger", "algo.beta.schedule=constant", "algo.beta.mixing=step"],
         ["algo=safe_dagger", "algo.sampling.rows=recent", "algo.sampling.expert=2"],
-        ["algo=ensemble_dagger"],
+        ["algo=ensemble_dagger", "algo.learner.contact=true"],
+        ["algo=dagger", "algo.learner.encoder=artflownet", "algo.learner.frozen=false"],
         ["algo=lazy_dagger"],
         ["algo=thrifty_dagger"],
     ],

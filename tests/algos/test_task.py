@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,13 +13,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from fb3d_rl.algos import task
 from fb3d_rl.algos.dagger import BUFFER
 from fb3d_rl.algos.run import run_training
 from fb3d_rl.algos.task import load_learner
 from fb3d_rl.algos.weights import CHECKPOINT
-from fb3d_rl.data import maniskill
+from fb3d_rl.data import lerobot, maniskill
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
+from fb3d_rl.env.any_task import make_task
 from fb3d_rl.errors import UserError
+from fb3d_rl.training.checkpoint import load_checkpoint
 from fb3d_rl.training.run_log import read_rows
 
 Config = Callable[[str, list[str]], Any]
@@ -28,6 +32,16 @@ SMALL = [
     "algo=dagger", *PICK, "algo.rounds=2", "algo.beta.schedule=first", "data.labels=100", "algo.epochs=6",
     "algo.learner.width=8", "evaluation.trials=2", "collector=direct", "env.horizon=40",
 ]  # fmt: skip
+
+
+SHORT = ["data.labels=60", "algo.epochs=4", "evaluation.trials=0", "algo.learner.head=act"]
+"""A run of which only the labels and weights matter."""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, config: Config) -> Path:
+    sys.path.insert(0, str(EXAMPLES))
+    return train(config, tmp_path_factory.mktemp("whole"), *SHORT)
 
 
 @pytest.fixture(autouse=True)
@@ -64,6 +78,54 @@ def test_rounds_labels_and_the_same_bits(tmp_path: Path, config: Config) -> None
     acted = load_learner(again / CHECKPOINT)(shown.clone())["action"]
     assert torch.equal(learner(shown.clone())["action"], acted), "the checkpoint is the whole learner"
     maniskill.write(buffer, tmp_path / "x.h5")  # what others read
+    lerobot.write(buffer, tmp_path / "lerobot", rate=20)
+    for read, source in ((maniskill.read, tmp_path / "x.h5"), (lerobot.read, tmp_path / "lerobot")):
+        copy = read(source, tmp_path / read.__module__)
+        assert copy.episodes == buffer.episodes and len(copy) == 100
+        whole = torch.arange(100)
+        assert bool((copy[whole] == buffer[whole]).all()), "and they come back in every bit"
+
+
+def test_an_episode_does_not_depend_on_those_before_it() -> None:
+    env = make_task("PickCube-v1", "pick_cube:make", "/", "state", 0, {"control_mode": "pd_ee_delta_pos"})
+
+    def states(seed: int) -> torch.Tensor:
+        env.set_trials([seed])
+        frames = env.rollout(25, lambda td: td.set("action", td["label", "action"]), break_when_any_done=True)
+        return frames["observation", "state"]
+
+    first, _, again = states(5), states(7), states(5)
+    assert torch.equal(first, again)
+
+
+class Stopped(Exception):
+    """The process ends here."""
+
+
+@pytest.mark.parametrize("save", [1, 2, 3, 5])
+def test_a_run_that_is_stopped_at_any_checkpoint_goes_on_to_the_same_bits(
+    tmp_path: Path, config: Config, monkeypatch: pytest.MonkeyPatch, whole: Path, save: int
+) -> None:
+    """Checkpoints are written at the start, and in each round after its labels, in its fit and at its end."""
+    calls, saved = 0, task.save_checkpoint
+
+    def stops(*args: Any, **kwargs: Any) -> None:
+        nonlocal calls
+        saved(*args, **kwargs)
+        calls += 1
+        if calls == save:
+            raise Stopped
+
+    monkeypatch.setattr(task, "save_checkpoint", stops)
+    with pytest.raises(Stopped):
+        train(config, tmp_path, *SHORT)
+    monkeypatch.setattr(task, "save_checkpoint", saved)
+    train(config, tmp_path, *SHORT, "resume=true")
+    assert read_rows(tmp_path / "metrics.jsonl", times=False) == read_rows(whole / "metrics.jsonl", times=False)
+    one, other = (load_checkpoint(out / CHECKPOINT)["state"]["model"] for out in (tmp_path, whole))
+    assert all(torch.equal(one[key], other[key]) for key in other)
+    rows, others = (DemonstrationBuffer.open(out / BUFFER) for out in (tmp_path, whole))
+    assert rows.episodes == others.episodes and bool((rows[torch.arange(60)] == others[torch.arange(60)]).all())
 
 
 @pytest.mark.slow
@@ -103,6 +165,8 @@ def test_what_cannot_be_is_one_sentence(tmp_path: Path, config: Config, override
         (["algo=artflownet", *PICK], "choose algo=bc or algo=dagger"),
         (["algo=safe_dagger", *PICK], "algo.gate.name=safe is for opening parts"),
         (["algo=bc_oracle", *PICK], "leave algo.oracle=false"),
+        (["algo=bc", *PICK, "algo.learner.contact=true"], "leave algo.learner.contact=false"),
+        (["algo=bc", *PICK, "algo.learner.encoder=artflownet"], "has seen objects that open"),
     ],
 )
 def test_options_that_a_task_has_no_use_for_are_refused(config: Config, overrides: list[str], words: str) -> None:

@@ -19,6 +19,7 @@ from fb3d_rl.policies.learner import (
     LearnerOptions,
     hand_features,
     history_of,
+    intention_of,
     rotated,
     twist_of,
 )
@@ -300,3 +301,72 @@ def test_a_predicted_discrepancy_is_positive_and_declared() -> None:
 def test_options_that_make_no_learner_are_refused(options: dict[str, object]) -> None:
     with pytest.raises(UserError, match=next(reversed(options))):
         LearnerOptions(**options)  # type: ignore[arg-type]
+
+
+def test_half_of_the_points_are_the_nearest_or_on_the_part() -> None:
+    td = scene(3)
+    obs = td["observation"]
+    tip, valid, part = obs["tool_pose"][:, None, :3], obs["valid"], obs["part_mask"] & obs["valid"]
+    for focus in ("hand", "part"):
+        policy = learner(focus=focus, flow="ground_truth", points=32)
+        shown = policy.network_inputs(td)
+        assert shown["points"].shape == (3, 32, 3) and bool(shown["valid"][:, :16].all())
+        evenly = learner(flow="ground_truth", points=32).network_inputs(td)
+        for key in ("points", "features", "valid"):
+            assert torch.equal(shown[key][:, 16:], evenly[key][:, :16]), "the other half is drawn as ever"
+        if focus == "hand":
+            distance = (obs["points"] - tip).norm(dim=-1).masked_fill(~valid, torch.inf)
+            nearest = distance.sort(dim=1).values[:, :16]
+            assert torch.allclose(shown["points"][:, :16].norm(dim=-1).sort(dim=1).values, nearest)
+        else:
+            assert bool((part.sum(1) >= 16).all()) and bool((shown["features"][:, :16, 0] == 1).all())
+        for row in range(3):  # each with its own flow
+            place = (obs["points"][row] - tip[row] - shown["points"][row, 5]).norm(dim=-1).argmin()
+            assert torch.equal(shown["features"][row, 5, 1:], td["privileged", "flow"][row, place])
+    few = td.clone()
+    few["observation", "part_mask"][:] = False
+    few["observation", "part_mask"][:, 70] = few["observation", "valid"][:, 70] = True
+    shown = learner(focus="part", points=32).network_inputs(few)
+    assert (shown["features"][..., 0].sum(1) == 1).all(), "a part that is hardly seen is shown whatever comes first"
+
+
+def test_a_guided_learner_plans_for_what_its_guide_tells() -> None:
+    policy, td = learner(contact=True, phase=True), scene(3)
+    inputs = policy.network_inputs(td)
+    told = policy.network.told(inputs).intention()
+    given = [policy.network(*(inputs[key] for key in INPUTS), meant)[0] for meant in (None, told)]
+    assert torch.equal(*given)
+    for change in ({"contact": told.contact + 0.1}, {"standoff": -told.standoff}, {"phase": told.phase.roll(1, 1)}):
+        other = policy.network(*(inputs[key] for key in INPUTS), told._replace(**change))[0]
+        same = ~(other != given[0]).any(1)
+        assert torch.equal(same, td["observation", "attached"].flatten() & ("phase" not in change)), change
+    near = (inputs["points"] - told.contact[:, None]).norm(dim=-1).masked_fill(~inputs["valid"], torch.inf)
+    assert bool((near.amin(1) < 0.06).all()), "at the points that are there"
+    again = Learner(policy.options, LIMITS, generator(5)).eval()
+    again.network.load_state_dict(policy.network.state_dict())
+    assert torch.equal(act(again, td)["action"], act(policy, td)["action"])
+
+
+def test_the_expert_s_intention_is_seen_from_the_tip() -> None:
+    td = scene(4)
+    place, axis = torch.rand(4, 3), torch.eye(3)[[0, 1, 2, 0]]
+    phase = torch.tensor([0, 1, 2, 3])[:, None]
+    td["expert"] = TensorDict({"contact_point": place, "standoff": axis, "phase": phase}, [4])
+    true, goes = intention_of(td)
+    assert torch.equal(true.contact, place - td["observation", "tool_pose"][:, :3]) and torch.equal(true.standoff, axis)
+    assert goes.tolist() == [False, True, True, False] and true.phase.argmax(1).tolist() == [0, 1, 2, 3]
+
+
+@pytest.mark.parametrize("frozen", [True, False])
+def test_the_published_flow_network_as_an_encoder(frozen: bool) -> None:
+    policy, published = learner(encoder="artflownet", frozen=frozen).train(), ArtFlowNet.from_pretrained()
+    flow = policy.network.encoder.flow
+    weights = {key: value for key, value in published.state_dict().items() if "head.1" not in key}
+    assert all(torch.equal(flow.state_dict()[key], weights[key]) for key in weights), "not those drawn at random"
+    before = {key: value.clone() for key, value in flow.state_dict().items()}
+    optimizer = torch.optim.Adam(policy.parameters(), lr=0.01)
+    policy.planned(policy.network_inputs(scene(3)))[0].square().sum().backward()
+    optimizer.step()
+    moved = {key for key, value in flow.state_dict().items() if not torch.equal(value, before[key])}
+    assert bool(moved) != frozen and not [key for key in moved if "running" in key or "num_batches" in key]
+    assert policy.network.encoder.attention.score.weight.grad.any()
