@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from fb3d_rl.algos.flow_network import FlowNetwork
 from fb3d_rl.camera.umpnet import SCALE
+from fb3d_rl.contract import GOAL_POINTS
 from fb3d_rl.data.pairs import PAIRS
 from fb3d_rl.env.umpnet.quasistatic import Paths, stroke
 from fb3d_rl.env.umpnet.world import STROKE
@@ -114,8 +115,10 @@ def pulls_objective(model: nn.Module, options: FitOptions) -> Objective:
         part = flow.any(-1) & valid & ~other
         part = part & (screw_of_flow(points, flow, part)[1] < UNEXPLAINED)[:, None]  # parts that follow others
         draws = torch.rand(part.shape, generator=generator(options.seed, 7, step)).to(points.device)
-        on_part, contact = draws.masked_fill(~part, -1.0).topk(CONTACTS, dim=-1)
-        off, beside = draws.masked_fill(~valid | other | movable, -1.0).topk(CONTACTS, dim=-1)
+        groups = part, valid & ~other & ~movable
+        (on_part, contact), (off, beside) = (
+            draws.masked_fill(~group, -1.0)[:, :-GOAL_POINTS].topk(CONTACTS, dim=-1) for group in groups
+        )
         shape = (*contact.shape, DIRECTIONS, 3)
         directions = normalize(torch.randn(shape, generator=generator(options.seed, 8, step)).to(points))
         true = pulled(batch, contact, directions)

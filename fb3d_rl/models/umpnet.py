@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from fb3d_rl.contract import GOAL_POINTS
 from fb3d_rl.geometry.points import gather
 from fb3d_rl.models.cloud_network import BACKBONES, CloudNetwork, from_centre
 from fb3d_rl.models.encoders import mlp
@@ -17,7 +18,7 @@ from there."""
 
 
 class Seen(NamedTuple):
-    """What the networks make of B pairs of clouds.
+    """What the networks make of B pairs of clouds, for each point of the present one.
 
     Attributes:
         movable: [B, N] log odds that a pull at a point moves it.
@@ -40,15 +41,15 @@ class UmpNet(CloudNetwork):
     UMPNet sees an image in which its gripper holds the part; here a PointNet++ gives each point a feature vector, and
     pulls are judged from that of the held point. As in the paper the position and the distance are inferred from the
     present alone, the arrow of time from the present and another image: the goal's, or the first one of an
-    exploration. Those two clouds lie in one, in which a flag tells them apart.
+    exploration. Those two clouds lie in one, the present first, in which a flag tells them apart.
 
     Args: as of :class:`CloudNetwork`; ``part_mask_input``, the flag, has to be true.
 
     Shapes:
-        points [B, N, 3] f32, m, world axes, of both clouds; valid [B, N] bool; other [B, N] bool, the points of the
-        other image; contact [B, K] int64; directions [B, K, S, 3], unit -> log odds [B, N] that a point can be moved;
-        distance [B, K, S], how far a pull moves the point, in strokes; arrow [B, K, S, 3], logits of TOWARDS, STILL,
-        AWAY.
+        points [B, N + GOAL_POINTS, 3] f32, m, world axes; valid, likewise, bool; other, likewise, bool, the points of
+        the other image; contact [B, K] int64; directions [B, K, S, 3], unit -> log odds [B, N] that a point can be
+        moved; distance [B, K, S], how far a pull moves the point, in strokes; arrow [B, K, S, 3], logits of TOWARDS,
+        STILL, AWAY.
     """
 
     NAME = "umpnet"
@@ -64,10 +65,10 @@ class UmpNet(CloudNetwork):
         self.arrow = mlp(self.OUTPUTS + 3, 128, 128, 3)
 
     def see(self, points: Tensor, valid: Tensor, other: Tensor) -> Seen:
-        """Look at pairs of clouds once, for any number of pulls. What it says of the other image's points is 0."""
-        now = valid & ~other
-        alone = self.present(from_centre(points, now), now, None)
-        return Seen(alone[..., -1], alone[..., :-1], self.per_point(points, valid, other))
+        """Look at pairs of clouds once, for any number of pulls."""
+        now, known = points[:, :-GOAL_POINTS], valid[:, :-GOAL_POINTS]
+        alone = self.present(from_centre(now, known), known, None)
+        return Seen(alone[..., -1], alone[..., :-1], self.per_point(points, valid, other)[:, :-GOAL_POINTS])
 
     def judge(self, at: tuple[Tensor, Tensor], directions: Tensor) -> tuple[Tensor, Tensor]:
         """Distances [..., S] and the arrow's logits [..., S, 3] of pulls along ``directions`` [..., S, 3] at points

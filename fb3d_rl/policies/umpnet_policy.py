@@ -73,7 +73,7 @@ class UmpnetFlow(Policy):
             torch.cat([torch.zeros_like(valid), other["valid"]], 1),
         )
         part = observed["part_mask"] & valid
-        likely = seen.movable[:, : points.shape[1]].sigmoid().masked_fill(~part, 0.0)
+        likely = seen.movable.sigmoid().masked_fill(~part, 0.0)
         held = observed["attached"].squeeze(-1)
         away = (points - observed["tool_pose"][:, None, :3]).norm(dim=-1).masked_fill(~part, torch.inf)
         contact = torch.where(held, away.argmin(-1), likely.argmax(-1))

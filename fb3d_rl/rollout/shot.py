@@ -175,8 +175,10 @@ def moments(film: Film) -> list[tuple[str, int]]:
                 chosen.append((name, contact + int(reached.argmax())))
             else:
                 t = contact + round(share * (last - contact))
-                chosen.append((f"step {t}", t))
+                chosen.append((f"step {t // film.per_step}", t))
     else:
-        chosen = [("start", 0)] + [(f"step {t}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
-    end = ("opened" if film.success else "end", last)
+        chosen = [("start", 0)] + [
+            (f"step {t // film.per_step}", t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()
+        ]
+    end = (film.aim[1] if film.success else "end", last)
     return [item for item, after in zip(chosen, [*chosen[1:], end], strict=True) if item[1] < after[1]] + [end]
