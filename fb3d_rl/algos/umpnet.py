@@ -16,15 +16,13 @@ from fb3d_rl.drawing.video import require_encoder
 from fb3d_rl.env.umpnet.scenes import read_scenes, sorted_out, stand_in
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.tables import show, summary
-from fb3d_rl.evaluation.umpnet import Job, Setting, evaluate_scenes, film_scenes, page
+from fb3d_rl.evaluation.umpnet import PAGE, Job, Setting, evaluate_scenes, film_scenes, page
 from fb3d_rl.files import write_text
 from fb3d_rl.rollout.rows import TrialRow
 
 if TYPE_CHECKING:
     from fb3d_rl.config import EvaluateConfig
     from fb3d_rl.env.umpnet.options import UmpnetOptions
-
-PAGE = "umpnet.md"
 
 
 def run(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:

@@ -38,6 +38,9 @@ from fb3d_rl.rollout.umpnet_film import film_scene
 from fb3d_rl.rollout.videos import write_films
 from fb3d_rl.training.run_log import read_rows
 
+PAGE = "umpnet.md"
+"""File of the run folder with the tables."""
+
 DETAILS = "umpnet.jsonl"
 """File of the run folder with a line for each row of rows.csv: what that has no columns for."""
 
