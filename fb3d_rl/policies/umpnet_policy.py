@@ -108,7 +108,7 @@ def _banned(state: TensorDictBase, moved: Tensor | None) -> Tensor:
 def best_pull(net: UmpNet, seen: Seen, contact: Tensor, sign: float, banned: Tensor, options: SearchOptions) -> Tensor:
     """The direction [B, 3] of the largest ``sign`` * :func:`score` at point number contact [B] of each cloud.
 
-    ``banned`` [B, M, 3] are directions near which the score counts as 0; those that are 0 ban nothing.
+    ``banned`` [B, M, 3] are directions near which there is none; those that are 0 ban nothing.
     """
     at = seen.at(contact)
 
@@ -116,7 +116,7 @@ def best_pull(net: UmpNet, seen: Seen, contact: Tensor, sign: float, banned: Ten
         directions = directions.expand(len(contact), -1, -1)
         found = sign * score(*net.judge(at, directions))
         ruled_out = (directions[:, :, None] * banned[:, None]).sum(-1) > CLOSE
-        return found.masked_fill(ruled_out.any(-1), 0.0)
+        return found.masked_fill(ruled_out.any(-1), -torch.inf)
 
     return best_direction(scores, options, contact.device)
 
