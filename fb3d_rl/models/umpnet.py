@@ -88,6 +88,11 @@ class UmpNet(CloudNetwork):
 
 
 def score(distance: Tensor, arrow: Tensor) -> Tensor:
-    """UMPNet's score of pulls: how far they bring the part away from the other image's state, negative towards it."""
-    sign: Tensor = arrow.argmax(-1) - STILL
+    """How far pulls bring the part away from the other image's state, negative towards it.
+
+    UMPNet multiplies the distance by the sign of the most probable answer of the arrow of time; here it is the expected
+    sign, which tells pulls apart that have the same answer.
+    """
+    odds = arrow.softmax(-1)
+    sign: Tensor = odds[..., AWAY] - odds[..., TOWARDS]
     return sign * distance.relu()

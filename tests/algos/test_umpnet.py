@@ -90,8 +90,10 @@ def test_labels_are_what_pulls_do(name: str, pairs: Pairs) -> None:
 
 
 def test_the_score_is_signed_by_the_arrow() -> None:
-    arrow = torch.eye(3)[[TOWARDS, STILL, AWAY, AWAY]]
-    assert score(torch.tensor([0.5, 0.5, 0.5, -0.5]), arrow).tolist() == [-0.5, 0.0, 0.5, 0.0]
+    arrow = 50.0 * torch.eye(3)[[TOWARDS, STILL, AWAY, AWAY]]
+    assert score(torch.tensor([0.5, 0.5, 0.5, -0.5]), arrow).tolist() == pytest.approx([-0.5, 0.0, 0.5, 0.0])
+    unsure = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert 0.0 == float(score(torch.ones(2), unsure)[0]) < float(score(torch.ones(2), unsure)[1]) < 1.0
 
 
 def test_pulls_are_learned_and_banned(pairs: Pairs) -> None:
