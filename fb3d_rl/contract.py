@@ -21,6 +21,9 @@ from fb3d_rl.errors import UserError as UserError  # its earlier place, which sc
 ACTION_DIM = 8
 """x y z, roll pitch yaw, two fingers (supplement, II.C)."""
 
+GOAL_POINTS = 512
+"""Points of a goal image's cloud."""
+
 
 Key = str | tuple[str, ...]
 
@@ -65,6 +68,12 @@ GROUPS: dict[str, dict[Key, Entry]] = {
         "contact": Entry((1,), BOOL, "suction has held the target part in this episode"),
         "held_opened": Entry((1,), BOOL, "a part that suction has held, the target or another, is open"),
     },
+    # What UMPNet's world shows besides.
+    "umpnet": {
+        ("goal", "points"): Entry((GOAL_POINTS, 3), F32, "of the goal image, world, m; in manipulation only"),
+        ("goal", "valid"): Entry((GOAL_POINTS,), BOOL, "False on padding; in manipulation only"),
+        ("pull", "moved"): Entry((1,), BOOL, "the last pull moved the part, or there was none yet"),
+    },
     "sample": {},
 }
 GROUPS["sample"] = {
@@ -75,7 +84,9 @@ GROUPS["sample"]["privileged", "link"] = Entry(("N",), torch.int16, "the link th
 
 
 def spec(group: str) -> dict[Key, Entry]:
-    """Return the keys of one group ("observation", "action", "privileged", "prediction", "metrics", "sample")."""
+    """Return the keys of one group ("observation", "action", "privileged", "prediction", "metrics", "umpnet",
+    "sample").
+    """
     return GROUPS[group]
 
 

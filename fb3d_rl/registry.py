@@ -102,6 +102,7 @@ REGISTRY = {
         algorithm="fb3d_rl.algos.ump_di:ALGORITHM",
         options=FITTED,
     ),
+    "umpnet": Entry({"": NOTHING}, algorithm="fb3d_rl.algos.umpnet_training:ALGORITHM", options=FITTED),
     "normal": Entry({"": NOTHING}, act="fb3d_rl.policies.baselines:normal_policy"),
     "random": Entry(
         {"": Access("nothing, and it sees nothing", mask=False)}, act="fb3d_rl.policies.baselines:random_policy"

@@ -76,6 +76,7 @@ POLICIES: dict[str, Callable[[], TensorDictModuleBase]] = {
     "flowbotpp": lambda: trained("flowbotpp", MASKED),
     "screwnet": lambda: trained("screwnet", MASKED),
     "ump_di": lambda: trained("ump_di", MASKED),
+    "umpnet": lambda: trained("umpnet", MASKED),
     "bc, dagger": lambda: learned("none", False),
     "bc_flow, dagger_flow": lambda: learned("ground_truth", False),
     "bc_oracle, dagger_oracle": lambda: learned("none", True),

@@ -25,6 +25,7 @@ from fb3d_rl.algos.weights import BEST, CHECKPOINT, NETWORK, best_cosine, load_n
 from fb3d_rl.assets.catalog import Entry
 from fb3d_rl.data.generate import Joined, generate_samples, load_samples, recipe_of
 from fb3d_rl.data.options import SampleOptions
+from fb3d_rl.data.samples import FLOWS, SampleKind
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import Protocol, evaluate, progress_bars
 from fb3d_rl.evaluation.flow import held_out_samples, predict
@@ -81,6 +82,7 @@ class FlowNetwork:
         objective: the loss to minimize; None for that of the flow.
         measure: computes the metrics of validation.
         flow: whether the network predicts the flow of a whole cloud.
+        samples: what it is fitted to.
         target: name of the user's own class that stands in for ``network`` (algo.network).
     """
 
@@ -89,6 +91,7 @@ class FlowNetwork:
     objective: Callable[[nn.Module, FitOptions], Objective] | None = None
     measure: Measure = flow_numbers
     flow: bool = True
+    samples: SampleKind = FLOWS
     target: str | None = None
 
     def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
@@ -123,6 +126,10 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
         with fitting(out / CHECKPOINT):
             check_state(net, options, resume["state"])
         best_cosine(out / BEST)
+    if cfg.data.met_by and kind.samples != FLOWS:
+        raise UserError(
+            f"algo={cfg.algo.name} learns from {kind.samples.name}, not from rollouts: leave data.met_by out"
+        )
     met_by = load_network(cfg.data.met_by) if cfg.data.met_by else None
     if met_by is not None:
         setup.require_simulator()
@@ -134,12 +141,12 @@ def run(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> list[TrialRow]:
         require_unseen(Path(cfg.data.dataset), [*entries.validation, *entries.held_out])
     else:
         drawn = [entry.folder for entry in entries.drawn(cfg.data.given_share)]
-        draw_samples(cfg, drawn, protocol.samples, out / SAMPLES)
+        draw_samples(kind, cfg, drawn, protocol.samples, out / SAMPLES)
     if met_by is not None:
         draw_rollout_samples(cfg, out, met_by, entries.train, protocol)
     wait_for_all()
-    buffer = training_rows(cfg, out)
-    validation = validation_samples(entries.validation, protocol.samples, cfg.seed)
+    buffer = training_rows(cfg, out, kind.samples)
+    validation = validation_samples(kind, entries.validation, protocol.samples, cfg.seed)
 
     def checkpoint(state: dict[str, Any]) -> None:
         save_checkpoint(out / CHECKPOINT, algo=cfg.algo.name, config=content(cfg), model_kwargs=net.arguments,
@@ -210,13 +217,16 @@ def draw_rollout_samples(
         rollout_samples(out / MET, loaded, acting, count, meeting, made_by, lambda n: bar.update(task, completed=n))
 
 
-def validation_samples(entries: list[Entry], options: SampleOptions, seed: int) -> TensorDictBase | None:
+def validation_samples(
+    kind: FlowNetwork, entries: list[Entry], options: SampleOptions, seed: int
+) -> TensorDictBase | None:
     """About ``VALIDATION_SAMPLES`` samples of the validation objects; None if none of them can be opened."""
     objects = setup.load(entries)
     if not any(openable_links(obj) for obj, _ in objects):
         return None
     count = max(2, math.ceil(VALIDATION_SAMPLES / len(objects)))
-    return held_out_samples(objects, options, count, derived(seed, "validation"), ("part",))["part"][0]
+    drawn = held_out_samples(objects, options, count, derived(seed, "validation"), ("part",), kind.samples)
+    return drawn["part"][0]
 
 
 def require_unseen(dataset: Path, entries: list[Entry]) -> None:
@@ -241,22 +251,24 @@ def assist(kind: FlowNetwork, cfg: TrainConfig, out: Path) -> None:
     resume = state_before(cfg, out)
     net = new_network(kind, cfg)
     wait_for_all()
-    rows, state = training_rows(cfg, out), resume["state"] if resume else None
+    rows, state = training_rows(cfg, out, kind.samples), resume["state"] if resume else None
     fit(net, rows, options, device=device, resume=state, progress=False)
 
 
-def draw_samples(cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> None:
+def draw_samples(kind: FlowNetwork, cfg: TrainConfig, folders: list[Path], samples: SampleOptions, out: Path) -> None:
     """Draw the flow samples to train on, with a progress bar."""
     count, workers = cfg.data.train_samples, setup.workers(cfg.data.workers)
     with progress_bars() as bar:
         task = bar.add_task("flow samples", total=count)
-        generate_samples(out, folders, count, cfg.seed, samples, workers, lambda n: bar.update(task, completed=n))
+        generate_samples(
+            out, folders, count, cfg.seed, samples, workers, lambda n: bar.update(task, completed=n), kind.samples
+        )
 
 
-def training_rows(cfg: TrainConfig, out: Path) -> Joined:
+def training_rows(cfg: TrainConfig, out: Path, kind: SampleKind = FLOWS) -> Joined:
     """The training samples: drawn ones, then those of rollouts."""
     folders = [Path(cfg.data.dataset or out / SAMPLES), *([out / MET] if cfg.data.met_by else [])]
-    parts = [load_samples(folder) for folder in folders]
+    parts = [load_samples(folder, kind) for folder in folders]
     return Joined(*(TensorDictReplayBuffer(storage=TensorStorage(part)) for part in parts))
 
 

@@ -12,44 +12,42 @@ from rich.console import Console
 
 from fb3d_rl.algos import setup
 from fb3d_rl.assets.articulation import ArticulatedObject
+from fb3d_rl.drawing.video import require_encoder
 from fb3d_rl.env.umpnet.scenes import read_scenes, sorted_out, stand_in
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.tables import show, summary
-from fb3d_rl.evaluation.umpnet import Job, Setting, evaluate_scenes, page
+from fb3d_rl.evaluation.umpnet import PAGE, Job, Setting, evaluate_scenes, film_scenes, page
 from fb3d_rl.files import write_text
-from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.rollout.rows import TrialRow
 
 if TYPE_CHECKING:
     from fb3d_rl.config import EvaluateConfig
     from fb3d_rl.env.umpnet.options import UmpnetOptions
 
-PAGE = "umpnet.md"
-
 
 def run(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     """Run the scenes with the configured policy, and with the expert if evaluation.expert says so.
 
-    Writes rows.csv, umpnet.jsonl, summary.json and umpnet.md below ``out``.
+    Writes rows.csv, umpnet.jsonl, summary.json, umpnet.md and films below ``out``.
 
     Raises:
         UserError: no scene has one of the objects, the policy follows no flow, or PyBullet is missing.
     """
-    from fb3d_rl.algos.run import acting  # imports this module's caller
+    from fb3d_rl.algos.run import policies_of  # imports this module's caller
 
-    chosen = acting(cfg.policy.name, cfg.checkpoint, cfg.policy.target, cfg.data.points)
-    cfg = setup.settled(cfg, chosen.part_mask_input)
-    limits, options = setup.velocity_limits(cfg), replace(setup.flow_policy_options(cfg), learn=False)
-    named = {"expert": expert_policy(limits, options)} if cfg.evaluation.expert else {}
-    named[chosen.name] = chosen.policy(limits, options)
+    learns = cfg.policy.flow.learn
+    # What a policy of the simulated task learns by touch is of no use here: episodes have a rule of their own.
+    plain = replace(cfg, policy=replace(cfg.policy, flow=replace(cfg.policy.flow, learn=False)))
+    cfg, named, facts, network = policies_of(plain)
+    if cfg.evaluation.videos:
+        require_encoder()
     objects = setup.load(setup.eval_entries(cfg.assets, out, cfg.seed))
     jobs, said = scheduled(objects, cfg.umpnet, cfg.assets.source == "procedural", cfg.evaluation.trials)
     collector = setup.collector_options(cfg)
     workers = 0 if collector.backend == "direct" else collector.workers
-    learn = frozenset({chosen.name} if cfg.policy.flow.learn and chosen.network is not None else ())
+    learn = frozenset([*named][-1:] if learns and network is not None else ())
     setting = Setting(cfg.umpnet, cfg.data.points, cfg.seed, workers, learn)
     details = evaluate_scenes(out, jobs, named, setting, cfg.resume)
-    facts = setup.facts(cfg)
     rows = [detail.row for detail in details]
     about = {"task": cfg.umpnet.task, "backend": cfg.umpnet.backend, "mask": cfg.umpnet.mask, "left_out": said}
     numbers = summary(rows, [], facts | {"umpnet": about})
@@ -57,6 +55,8 @@ def run(cfg: EvaluateConfig, out: Path) -> list[TrialRow]:
     write_text(out / PAGE, page(details, setting, said, facts["command"]))
     show(numbers, Console())
     print(*said, f"the tables are in {out / PAGE}", sep="\n")
+    if cfg.evaluation.videos:
+        film_scenes(out / "videos", rows, cfg.evaluation.videos, jobs, named, setting)
     return rows
 
 

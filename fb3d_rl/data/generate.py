@@ -20,7 +20,7 @@ from fb3d_rl.assets.partnet_mobility import content_of, load_object
 from fb3d_rl.camera.embree import use_one_thread
 from fb3d_rl.children import withheld, worker_pool
 from fb3d_rl.data.picking import Index, pick
-from fb3d_rl.data.samples import SampleOptions, draw_sample
+from fb3d_rl.data.samples import FLOWS, SampleKind, SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.files import write_text
 from fb3d_rl.scene.posed import Posed
@@ -34,7 +34,7 @@ DAMAGED = (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeErro
 """The exceptions of reading a data set with missing or damaged files."""
 
 
-Job: TypeAlias = tuple[Path, Path, int, np.ndarray, int, SampleOptions]
+Job: TypeAlias = tuple[Path, Path, int, np.ndarray, int, SampleOptions, SampleKind]
 """The arguments of :func:`_draw_object`."""
 
 
@@ -46,6 +46,7 @@ def generate_samples(
     options: SampleOptions,
     workers: int,
     progress: Callable[[int], None] = lambda done: None,
+    kind: SampleKind = FLOWS,
 ) -> TensorDictBase:
     """Fill a memory map with ``count`` samples of the objects in ``folders``.
 
@@ -61,6 +62,7 @@ def generate_samples(
         options: how samples are drawn.
         workers: number of worker processes; 0 draws in this process.
         progress: called with the number of samples drawn so far.
+        kind: what is drawn.
 
     Returns:
         TensorDict [S] of the contract's group "sample" plus "object" [S] int64, an index into ``folders``, and
@@ -75,19 +77,20 @@ def generate_samples(
         "seed": seed,
         "options": asdict(options),
         "version": 3,
+        **({} if kind == FLOWS else {"kind": kind.name}),
     }
     done = finished_rows(out, recipe)
     if done is not None:
         progress(count)
         return done
-    empty_rows(out, count, options.points)
+    empty_rows(out, count, options.points, kind)
     owner = np.random.default_rng([seed, 0]).permutation(count) % len(folders)
     first = {folder: f for f, folder in reversed(list(enumerate(folders)))}
     owner = np.array([first[folder] for folder in folders])[owner]
     order, starts = owner.argsort(kind="stable"), np.bincount(owner, minlength=len(folders)).cumsum()
     rows_of = np.split(order, starts[:-1])
     jobs = [
-        (out / "rows", folder, f, rows_of[f], seed, options)
+        (out / "rows", folder, f, rows_of[f], seed, options, kind)
         for folder, f in sorted(first.items(), key=lambda item: item[1])
     ]
     missing = _draw_objects(jobs, workers, progress)
@@ -172,19 +175,21 @@ class Joined:
         return rows
 
 
-def load_samples(folder: Path) -> TensorDictBase:
+def load_samples(folder: Path, kind: SampleKind | None = None) -> TensorDictBase:
     """The finished data set that :func:`generate_samples` left in a folder, as rows [S] on disk.
 
     Raises:
-        UserError: there is none, or it is damaged.
+        UserError: there is none, it is damaged, or not of that ``kind``.
     """
     if not (folder / DONE).is_file():
         raise UserError(f"{folder} holds no finished flow samples; give the samples/ of a run of algo=artflownet")
     try:
-        rows = _rows(folder)
+        rows, found = _rows(folder), recipe_of(folder).get("kind", FLOWS.name)
         contract.check(rows, "sample")
     except DAMAGED as error:
         raise UserError(f"the flow samples at {folder} are damaged ({error}); copy or draw them anew") from error
+    if kind is not None and found != kind.name:
+        raise UserError(f"{folder} holds {found}, not {kind.name}: give a data set that this algorithm has drawn")
     return rows
 
 
@@ -211,21 +216,9 @@ def _quiet() -> None:
     use_one_thread()
 
 
-def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:
+def empty_rows(out: Path, count: int, points: int, kind: SampleKind = FLOWS) -> TensorDictBase:
     """A memory map of ``count`` rows of zeros in a folder, which is emptied first."""
-    row = TensorDict(
-        {
-            "observation": {
-                "points": torch.zeros(points, 3),
-                "valid": torch.zeros(points, dtype=torch.bool),
-                "part_mask": torch.zeros(points, dtype=torch.bool),
-            },
-            "privileged": {"flow": torch.zeros(points, 3), "link": torch.zeros(points, dtype=torch.int16)},
-            "target": torch.zeros((), dtype=torch.int64),
-            "object": torch.zeros((), dtype=torch.int64),
-        },
-        batch_size=[],
-    )
+    row = kind.blank(points).update({"object": torch.zeros((), dtype=torch.int64)})
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     rows: TensorDictBase = row.expand(count).memmap_like(out / "rows")
@@ -233,7 +226,7 @@ def empty_rows(out: Path, count: int, points: int) -> TensorDictBase:
 
 
 def _draw_object(
-    rows_dir: Path, folder: Path, index: int, rows: np.ndarray, seed: int, options: SampleOptions
+    rows_dir: Path, folder: Path, index: int, rows: np.ndarray, seed: int, options: SampleOptions, kind: SampleKind
 ) -> list[int]:
     """Draw the samples ``rows`` of one object into the memory map; return those that could not be drawn."""
     if not len(rows):
@@ -244,7 +237,7 @@ def _draw_object(
     table = TensorDict.load_memmap(rows_dir)
     missing = []
     for row in rows.tolist():
-        sample = draw_sample(posed, options, np.random.default_rng([seed, 1, row]))
+        sample = kind.draw(posed, options, np.random.default_rng([seed, 1, row]))
         if sample is None:
             missing.append(row)
             continue

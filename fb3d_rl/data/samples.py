@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -46,14 +49,49 @@ def draw_sample(posed: Posed, options: SampleOptions, rng: np.random.Generator) 
             targets: tuple[int, ...] = (link,) if masked and share >= options.all_parts_share else ()
             if targets and share < options.all_parts_share + options.some_parts_share:
                 targets += tuple(other for other in movable if other != link and rng.random() < 0.5)
-            return _turned(flow_sample(cloud, *targets, masked=masked), posed.camera.turn(view))
+            return turned(flow_sample(cloud, *targets, masked=masked), posed.camera.turn(view))
     return None
 
 
-def _turned(sample: TensorDict, turn: NDArray[np.float64] | None) -> TensorDict:
+def turned(sample: TensorDict, turn: NDArray[np.float64] | None) -> TensorDict:
     """A sample whose points and flow are turned by R [3, 3]."""
     if turn is not None:
         rotation = torch.from_numpy(turn).float()
         for key in (("observation", "points"), ("privileged", "flow")):
             sample[key] = sample[key] @ rotation.T
     return sample
+
+
+def blank_sample(points: int) -> TensorDict:
+    """A sample of zeros, of so many points."""
+    return TensorDict(
+        {
+            "observation": {
+                "points": torch.zeros(points, 3),
+                "valid": torch.zeros(points, dtype=torch.bool),
+                "part_mask": torch.zeros(points, dtype=torch.bool),
+            },
+            "privileged": {"flow": torch.zeros(points, 3), "link": torch.zeros(points, dtype=torch.int16)},
+            "target": torch.zeros((), dtype=torch.int64),
+        },
+        batch_size=[],
+    )
+
+
+@dataclass(frozen=True)
+class SampleKind:
+    """What the rows of a data set are.
+
+    Attributes:
+        name: by which data sets are told apart, a plural.
+        draw: draws a sample of an object; None if none of its parts is visible.
+        blank: a sample of zeros, of a cloud of so many points.
+    """
+
+    name: str
+    draw: Callable[[Posed, SampleOptions, np.random.Generator], TensorDict | None]
+    blank: Callable[[int], TensorDict]
+
+
+FLOWS = SampleKind("flow samples", draw_sample, blank_sample)
+"""The kind that flow networks learn from."""

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase, lazy_stack
 from torch import nn
 
 from fb3d_rl.assets.articulation import ArticulatedObject
-from fb3d_rl.data.samples import SampleOptions, draw_sample
+from fb3d_rl.data.samples import FLOWS, SampleKind, SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.flow.metrics import flow_metrics, hypothesis_metrics
 from fb3d_rl.models.artflownet import proposes_several
@@ -28,8 +28,9 @@ def held_out_samples(
     count: int,
     seed: int,
     targets: Sequence[str] = TARGETS,
+    kind: SampleKind = FLOWS,
 ) -> dict[str, tuple[TensorDictBase, list[tuple[ArticulatedObject, str, str]]]]:
-    """Draw ``count`` samples of each object for each of ``targets`` ("part", "all").
+    """Draw ``count`` samples of each object for each of ``targets`` ("part", "all"), of this ``kind``.
 
     Returns:
         For each target the samples [S] (contract group "sample") and for each sample its object, split and link's
@@ -47,7 +48,7 @@ def held_out_samples(
             wanted = replace(options, all_parts_share=float(target == "all"), some_parts_share=0.0, unmasked_share=0.0)
             for number in range(count):
                 rng = np.random.default_rng([seed, 4, zlib.crc32(obj.id.encode()), number])
-                sample = draw_sample(posed, wanted, rng)
+                sample = kind.draw(posed, wanted, rng)
                 if sample is not None:
                     drawn[target][0].append(sample)
                     link = "*" if target == "all" else obj.links[int(sample["target"])].name

@@ -29,11 +29,17 @@ from fb3d_rl.files import write_text
 from fb3d_rl.policies.digest import policy_digest
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.pulling import flow_of
+from fb3d_rl.rollout.film import Film
 from fb3d_rl.rollout.rows import CRASHED, NEVER_TOUCHED, STUCK, TIMED_OUT, WRONG_WAY, TrialRow, policies, write_trials
 from fb3d_rl.rollout.run import mask_of
 from fb3d_rl.rollout.umpnet import SUCCESS as NEAR
 from fb3d_rl.rollout.umpnet import Episode, run_episodes
+from fb3d_rl.rollout.umpnet_film import film_scene
+from fb3d_rl.rollout.videos import write_films
 from fb3d_rl.training.run_log import read_rows
+
+PAGE = "umpnet.md"
+"""File of the run folder with the tables."""
 
 DETAILS = "umpnet.jsonl"
 """File of the run folder with a line for each row of rows.csv: what that has no columns for."""
@@ -100,8 +106,13 @@ class Setting:
     def key(self, scene: Scene, obj: ArticulatedObject) -> str:
         """What a trial is, as :func:`fb3d_rl.rollout.trials.trial_key` gives it for others."""
         options = asdict(self.options) | {"batch": 0}
-        whole = [repr(scene), content_digest(obj), options, self.points, self.seed, sorted(self.learn)]
+        whole = [repr(scene), content_digest(obj), options, self.points, self.seed, []]
         return hashlib.sha256(json.dumps(whole).encode()).hexdigest()[:16]
+
+    def digest(self, name: str, policy: TensorDictModuleBase) -> str:
+        """Identifies the policy of that name, and whether it learns."""
+        digest = policy_digest(policy)
+        return hashlib.sha256(f"{digest} learns".encode()).hexdigest()[:16] if name in self.learn else digest
 
 
 Job = tuple[int, Scene, ArticulatedObject, str]
@@ -137,6 +148,26 @@ def evaluate_scenes(
     return rows
 
 
+def film_scenes(
+    folder: Path, rows: Sequence[TrialRow], count: int, jobs: Sequence[Job],
+    named: Mapping[str, TensorDictModuleBase], setting: Setting,
+) -> None:  # fmt: skip
+    """Write films of ``count`` scenes with every policy below a folder."""
+    scheduled = {job[0]: job for job in jobs}
+
+    def again(row: TrialRow) -> Film:
+        _, scene, obj, _ = scheduled[row.trial]
+        name, policy = row.policy, named[row.policy]
+        return film_scene(
+            name, place(scene, obj), flow_of(policy, name), setting.options, setting.points, setting.seed,
+            isinstance(policy, FlowPolicy), name in setting.learn, NEAR,
+        )  # fmt: skip
+
+    with progress_bars() as bar:
+        task = bar.add_task("videos", total=None)
+        write_films(folder, rows, count, again, lambda done, total: bar.update(task, completed=done, total=total))
+
+
 def _write(out: Path, details: Sequence[Detail]) -> None:
     write_text(out / DETAILS, "".join(json.dumps(asdict(detail)) + "\n" for detail in details))
     write_trials(out / "rows.csv", [detail.row for detail in details])
@@ -160,7 +191,7 @@ def _before(
     if not path.is_file():
         return []
     keys = {job[0]: setting.key(job[1], job[2]) for job in jobs}
-    digests = {name: policy_digest(policy) for name, policy in named.items()}
+    digests = {name: setting.digest(name, policy) for name, policy in named.items()}
     found = read_details(path)
     for row in (detail.row for detail in found):
         refuse_other(path, row, keys.get(row.trial), digests.get(row.policy))
@@ -189,7 +220,7 @@ def _one_thread() -> None:
 def run_chunk(name: str, policy: TensorDictModuleBase, setting: Setting, jobs: Sequence[Job]) -> list[Detail]:
     """Run some scenes side by side; if that crashes, each alone, so that those at fault are failures and no others."""
     flow = flow_of(policy, name)
-    common: dict[str, Any] = {"policy": name, "mask": mask_of(policy), "policy_digest": policy_digest(policy)}
+    common: dict[str, Any] = {"policy": name, "mask": mask_of(policy), "policy_digest": setting.digest(name, policy)}
     try:
         placed = [place(scene, obj) for _, scene, obj, _ in jobs]
         expert, learn = isinstance(policy, FlowPolicy), name in setting.learn

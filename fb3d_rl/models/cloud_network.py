@@ -74,15 +74,11 @@ class CloudNetwork(nn.Module):
         """Points [B, N, 3] f32 (m, world axes), valid [B, N] bool and part_mask [B, N] bool, None where nobody marked a
         part -> [B, N, OUTPUTS]; 0 on invalid points.
         """
-        inside = valid[..., None].to(points.dtype)
-        # Padding may hold anything, even NaN, which a product with 0 would keep.
-        points = points.masked_fill(~valid[..., None], 0.0)
-        centre = points.sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1.0)
         features = None
         if self.part_mask_input:
             shown = valid if part_mask is None else part_mask  # as it was trained where there is none
             features = shown[..., None].to(points.dtype)
-        output: Tensor = self.network(points - centre, valid, features)
+        output: Tensor = self.network(from_centre(points, valid), valid, features)
         return output
 
     def digest(self) -> str:
@@ -132,3 +128,11 @@ class CloudNetwork(nn.Module):
                 f"{file} is damaged or holds no {cls.__name__} ({type(error).__name__}): fetch it anew."
             ) from error
         return net.eval()
+
+
+def from_centre(points: Tensor, valid: Tensor) -> Tensor:
+    """Points [B, N, 3] less the mean of a cloud's valid ones [B, N]."""
+    inside = valid[..., None].to(points.dtype)
+    # Padding may hold anything, even NaN, which a product with 0 would keep.
+    points = points.masked_fill(~valid[..., None], 0.0)
+    return points - points.sum(1, keepdim=True) / inside.sum(1, keepdim=True).clamp(min=1.0)

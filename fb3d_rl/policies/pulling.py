@@ -7,9 +7,10 @@ that follows a flow does so here: what writes its flow is run, and what turns fl
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 
@@ -17,13 +18,30 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.policies.baselines import RandomPolicy
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.interaction import uniform
+from fb3d_rl.policies.policy import initial_state
 
 PREDICTED = ("prediction", "flow")
-FlowOf = Callable[[TensorDictBase], Tensor]
+
+
+@dataclass(frozen=True)
+class FlowOf:
+    """What gives the flow [E, N, 3] that a policy follows, from TensorDicts [E] of its observations.
+
+    Attributes:
+        answer: the function; what the policy remembers it writes below "next".
+        state: what it remembers of an episode at its start, [].
+    """
+
+    answer: Callable[[TensorDictBase], Tensor]
+    state: TensorDict = field(default_factory=lambda: TensorDict({}, batch_size=[]))
+
+    def __call__(self, seen: TensorDictBase) -> Tensor:
+        """See the class."""
+        return self.answer(seen)
 
 
 def flow_of(policy: TensorDictModuleBase, name: str) -> FlowOf:
-    """What gives the flow [E, N, 3] that a policy follows, from TensorDicts [E] of its observations.
+    """The flow that a policy follows.
 
     Args:
         policy: one of the registry, or one from outside that writes ("prediction", "flow").
@@ -33,13 +51,13 @@ def flow_of(policy: TensorDictModuleBase, name: str) -> FlowOf:
         UserError: it follows no flow; at once, or where it is one from outside when it is asked.
     """
     if isinstance(policy, RandomPolicy):
-        return _random_flow
+        return FlowOf(_random_flow)
     if isinstance(policy, FlowPolicy):
         key = policy.flow_key
-        return lambda seen: seen[key]
+        return FlowOf(lambda seen: seen[key])
     if isinstance(policy, TensorDictSequential) and isinstance(policy.module[-1], FlowPolicy):
         key, before = policy.module[-1].flow_key, TensorDictSequential(*policy.module[:-1])
-        return lambda seen: before(seen)[key]
+        return FlowOf(lambda seen: before(seen)[key], initial_state(before, torch.Size([])))
 
     def written(seen: TensorDictBase) -> Tensor:
         flow = policy(seen).get(PREDICTED, None)
@@ -49,7 +67,7 @@ def flow_of(policy: TensorDictModuleBase, name: str) -> FlowOf:
             )
         return flow
 
-    return written
+    return FlowOf(written, initial_state(policy, torch.Size([])))
 
 
 def _random_flow(seen: TensorDictBase) -> Tensor:

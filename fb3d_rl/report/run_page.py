@@ -17,6 +17,7 @@ from fb3d_rl.report.blocks import COPIED, FACTS, bars, effort, terms
 from fb3d_rl.report.gallery import films, gallery
 from fb3d_rl.report.page import Block, Cards, Cell, Facts, Figure, Heading, Note, Row, Section, Shown, Source, Table
 from fb3d_rl.report.robot_page import robot_tables
+from fb3d_rl.report.umpnet_page import umpnet_tables
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.rows import policies as policies_in
 
@@ -42,6 +43,7 @@ def write_report(run_dir: Path, out: Path | None = None) -> Path:
     sections = [
         Section("Results", _headline(numbers)),
         Section("The robot's trials, beside Tables IV and V", robot_tables(run.robot)),
+        Section("In UMPNet's world, beside Tables II and III", umpnet_tables(run.path)),
         Section("Geometry left out while reading", _lost(numbers)),
         Section("Success by category", _success_bars(numbers)),
         Section("How trials ended", _ends(run.rows, policies, numbers.get("policy"))),

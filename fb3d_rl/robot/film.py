@@ -84,6 +84,15 @@ class Filmed:
         return len(self._poses)
 
     @property
+    def aim(self) -> tuple[str, str]:
+        """As of :class:`~fb3d_rl.rollout.film.Film`."""
+        return "opened", "opened"
+
+    def moment(self, t: int) -> str:
+        """What moment ``t`` is called."""
+        return f"after {self._told[t][0]:.0f} s"
+
+    @property
     def attached(self) -> NDArray[np.bool_]:
         """Whether the cup holds something [T]."""
         return np.array([held for _, held, _, _ in self._told])
@@ -109,7 +118,7 @@ class Filmed:
 
     def write_filmstrip(self, path: Path) -> None:
         """Write a PNG of its important moments, side by side."""
-        shown = moments(self, lambda t: f"after {self._told[t][0]:.0f} s")
+        shown = moments(self)
         width = 2 * still_width(len(shown), STRIP_WIDTH)
         studio, bodies = self._stage((width, 3 * width // 4))
         stills = [Still(name, self._state(t), studio.picture(self._placed(bodies, t))) for name, t in shown]

@@ -43,6 +43,8 @@ class Film:
         success: whether the part was open at the end.
         rate: control steps per second.
         expert_acts: [T], whether the expert acted in a step, of an episode that it shared with a learner; else None.
+        per_step: moments of a step.
+        aim: what ``opened`` is a share of, for captions ("40 % opened"), and the name of a success.
     """
 
     policy: str
@@ -60,9 +62,15 @@ class Film:
     success: bool
     rate: int
     expert_acts: NDArray[np.bool_] | None = None
+    per_step: int = 1
+    aim: tuple[str, str] = ("opened", "opened")
 
     def __len__(self) -> int:
         return len(self.poses)
+
+    def moment(self, t: int) -> str:
+        """What moment ``t`` is called."""
+        return f"step {t // self.per_step}"
 
     @property
     def opened(self) -> NDArray[np.float32]:

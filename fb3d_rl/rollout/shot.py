@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -176,11 +176,16 @@ class Course(Protocol):
     @property
     def success(self) -> bool: ...
 
+    @property
+    def aim(self) -> tuple[str, str]: ...
+
+    def moment(self, t: int) -> str: ...
+
     def __len__(self) -> int: ...
 
 
-def moments(film: Course, called: Callable[[int], str] = "step {}".format) -> list[tuple[str, int]]:
-    """Up to six important moments of a film, in order, each with its name; ``called`` names those without one."""
+def moments(film: Course) -> list[tuple[str, int]]:
+    """Up to six important moments of a film, in order, each with its name."""
     last = len(film) - 1
     if film.attached.any():
         contact = int(film.attached.argmax())
@@ -194,8 +199,9 @@ def moments(film: Course, called: Callable[[int], str] = "step {}".format) -> li
                 chosen.append((name, contact + int(reached.argmax())))
             else:
                 t = contact + round(share * (last - contact))
-                chosen.append((called(t), t))
+                chosen.append((film.moment(t), t))
     else:
-        chosen = [("start", 0)] + [(called(t), t) for t in np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()]
-    end = ("opened" if film.success else "end", last)
+        between = np.linspace(0, last, 6).round().astype(int)[1:-1].tolist()
+        chosen = [("start", 0)] + [(film.moment(t), t) for t in between]
+    end = (film.aim[1] if film.success else "end", last)
     return [item for item, after in zip(chosen, [*chosen[1:], end], strict=True) if item[1] < after[1]] + [end]

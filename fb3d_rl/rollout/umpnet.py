@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl.camera.umpnet import camera_pose
 from fb3d_rl.camera.views import View, pixel_points, pixel_rays
+from fb3d_rl.contract import GOAL_POINTS
 from fb3d_rl.env.umpnet.options import UmpnetOptions
 from fb3d_rl.env.umpnet.scenes import CAMERA, Placed
 from fb3d_rl.env.umpnet.world import World, make_world
@@ -69,6 +70,8 @@ class Episode:
         placed: the scene.
         rng: draws the clouds; the same in each scene, as UMPNet seeds before each of them.
         goal: the goal image, None where there is none.
+        goal_cloud: a cloud of it: points [GOAL_POINTS, 3] and their links, -1 on padding.
+        memory: what the policy remembers.
         values: positions (rad or m of the object) of the held or selected joint: at the start and after each pull.
         right: the first point was on a part that may be moved; the selected one where there is a goal.
         link: the held link, -1 before there is one.
@@ -77,11 +80,15 @@ class Episode:
         before: the point [3] that was held before the last pull, None before the first one.
         motion: unit direction [3] in which a pull last moved the held point, None if none has.
         stuck: how many pulls in succession have not moved it.
+        went: UMPNet calls the joint moved by the last pull, or there was none yet.
+        seen: what was seen at each decision and the policy's flow [N, 3] there, for films; None to keep none.
     """
 
     placed: Placed
     rng: np.random.Generator
     goal: _Image | None = None
+    goal_cloud: tuple[NDArray[np.float32], NDArray[np.int64]] | None = None
+    memory: TensorDict = field(default_factory=lambda: TensorDict({}, batch_size=[]))
     values: list[float] = field(default_factory=list)
     right: bool = False
     link: int = -1
@@ -90,6 +97,8 @@ class Episode:
     before: NDArray[np.float64] | None = None
     motion: NDArray[np.float64] | None = None
     stuck: int = 0
+    went: bool = True
+    seen: list[tuple[Seen, NDArray[np.float64]]] | None = None
 
     @property
     def joint(self) -> int:
@@ -112,13 +121,14 @@ class Episode:
         least = 0.05 / placed.scene.scale if prismatic else 0.1
         near, goal = min(least, (high - low) / 3.5), placed.goal[joint]
         self.values.append(position)
+        self.went = abs(position - last) > least or abs(position - last) * 3.5 > high - low
         if placed.joint >= 0:
             crossed = (last > goal and position < goal + near) or (last < goal and position > goal - near)
             self.reached = bool(crossed or abs(position - goal) < near)
             return
         away = abs(position - goal) > near
         self.reached = bool(away and (position < low + near or position > high - near))
-        if abs(position - last) <= least and abs(position - last) * 3.5 <= high - low:
+        if not self.went:
             self.sense = -self.sense  # it did not move that way
 
     @property
@@ -171,11 +181,8 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
     placed, (pose, rays) = episode.placed, _rays()
     posed, scale = placed.posed, placed.scene.scale
     poses = posed.poses(state)
-    depth, bodies = posed.camera.depth_image(poses, VIEW)
-    pixels = np.flatnonzero(bodies >= 0)
-    points = pixel_points(pose, rays, pixels, depth.ravel()[pixels])
-    above = points[:, 2] > GROUND / scale
-    pixels, points = pixels[above], points[above]
+    depth, bodies = image = posed.camera.depth_image(poses, VIEW)
+    pixels, points = _seen_points(image, scale)
     told = np.zeros(len(pixels), dtype=bool)
     if episode.goal is not None and options.mask == "goal":
         told = _told(episode.goal, depth, pixels, rays, scale)
@@ -191,6 +198,11 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
     floor = np.array([0.0, 0.0, points[:, 2].min() if len(points) else 0.0])
     truth["points"] = torch.from_numpy((cloud - floor).astype(np.float32)) * truth["valid"][:, None]
     tip = np.zeros(3) if held is None else held - floor
+    if episode.goal_cloud is not None:
+        there, known = torch.from_numpy(episode.goal_cloud[0]), torch.from_numpy(episode.goal_cloud[1] >= 0)
+        shown = {"points": (there - torch.from_numpy(floor).float()) * known[:, None], "valid": known}
+    else:
+        shown = {}
     frame = TensorDict(
         {
             "observation": {
@@ -202,10 +214,20 @@ def look(episode: Episode, state: NDArray[np.float64], held: NDArray[np.float64]
             },
             "privileged": {"flow": truth["flow"], "link": truth["link"]},
             "seed": torch.tensor([seed]), "elapsed_steps": torch.tensor([len(episode.values)]),
+            "pull": {"moved": torch.tensor([episode.went])}, **({"goal": shown} if shown else {}),
         },
         batch_size=[],
     )  # fmt: skip
+    frame.update(episode.memory)
     return Seen(frame, cloud, links)
+
+
+def _seen_points(image: _Image, scale: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The pixels [P] in which an image shows the object above the ground, and their world points [P, 3]."""
+    pixels = np.flatnonzero(image[1] >= 0)
+    points = pixel_points(*_rays(), pixels, image[0].ravel()[pixels])
+    above = points[:, 2] > GROUND / scale
+    return pixels[above], points[above]
 
 
 def _told(
@@ -234,7 +256,7 @@ def _true_way(episode: Episode, state: NDArray[np.float64], held: NDArray[np.flo
 @torch.no_grad()
 def run_episodes(
     placed: Sequence[Placed], flow_of: FlowOf, options: UmpnetOptions, points: int, seed: int, expert: bool = False,
-    learn: bool = False,
+    learn: bool = False, keep: bool = False,
 ) -> list[Episode]:  # fmt: skip
     """Run scenes side by side with one policy.
 
@@ -246,11 +268,14 @@ def run_episodes(
         seed: of each scene.
         expert: the flow is the truth, also at a held point that is hidden.
         learn: whether what pulls do corrects the flow (:func:`_learned`).
+        keep: whether episodes keep what is seen.
 
     Raises:
         UserError: the world cannot be made, or the policy follows no flow.
     """
-    episodes = [Episode(one, np.random.default_rng(seed)) for one in placed]
+    episodes = [Episode(one, np.random.default_rng(seed), memory=flow_of.state.clone()) for one in placed]
+    for episode in episodes:
+        episode.seen = [] if keep else None
     world = make_world(options.backend, placed)
     try:
         for episode in episodes:
@@ -258,6 +283,7 @@ def run_episodes(
             if episode.placed.joint >= 0:
                 episode.goal = posed.camera.depth_image(posed.poses(episode.placed.goal), VIEW)
                 episode.sense = 1.0 if episode.placed.towards_open else -1.0
+                episode.goal_cloud = _goal_cloud(episode.goal, episode.placed.scene.scale, seed)
         _take_hold(world, episodes, flow_of, options, points, seed)
         while any(episode.left for episode in episodes):
             _pull(world, episodes, flow_of, options, points, seed, expert, learn)
@@ -266,11 +292,30 @@ def run_episodes(
     return episodes
 
 
-def _decide(seen: Sequence[Seen], flow_of: FlowOf, points: int) -> NDArray[np.float64]:
-    """Flows [B, N, 3] of a policy for what is seen of B scenes."""
+def _goal_cloud(goal: _Image, scale: float, seed: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Drawn by a generator of its own, so that the other clouds of a scene are the same for all policies."""
+    pixels, points = _seen_points(goal, scale)
+    return sample_cloud(points, goal[1].ravel()[pixels], GOAL_POINTS, np.random.default_rng([seed, 1]))
+
+
+def _decide(episodes: Sequence[Episode], seen: Sequence[Seen], flow_of: FlowOf) -> NDArray[np.float64]:
+    """Flows [B, N, 3] of a policy for what is seen of B scenes, which keep what it remembers."""
     frames: TensorDictBase = torch.stack([one.frame for one in seen])
     flow = flow_of(frames).double()
-    return np.asarray(flow.masked_fill(~frames["observation", "valid"][..., None], 0.0).numpy())
+    for group in flow_of.state.keys():
+        for episode, after in zip(episodes, frames["next", group].unbind(0), strict=True):
+            episode.memory[group] = after.clone()
+    flows: NDArray[np.float64] = flow.masked_fill(~frames["observation", "valid"][..., None], 0.0).numpy()
+    for episode, one, answer in zip(episodes, seen, flows, strict=True):
+        if episode.seen is not None:
+            episode.seen.append((one, answer))
+    return flows
+
+
+def chosen_point(seen: Seen, flow: NDArray[np.float64]) -> int:
+    """Number of the point that is held: that of the largest flow of those that the policy is told are the part's."""
+    mask = seen.frame["observation", "part_mask"].numpy()
+    return int((np.linalg.norm(flow, axis=1) * mask).argmax())
 
 
 def _take_hold(
@@ -279,9 +324,8 @@ def _take_hold(
     """Hold each part where its flow is largest; a point elsewhere ends the episode."""
     states = world.states
     seen = [look(episode, states[k], None, options, points, seed) for k, episode in enumerate(episodes)]
-    for k, (episode, one, flow) in enumerate(zip(episodes, seen, _decide(seen, flow_of, points), strict=True)):
-        mask = one.frame["observation", "part_mask"].numpy()
-        chosen = int((np.linalg.norm(flow, axis=1) * mask).argmax())
+    for k, (episode, one, flow) in enumerate(zip(episodes, seen, _decide(episodes, seen, flow_of), strict=True)):
+        chosen = chosen_point(one, flow)
         link = int(one.links[chosen])
         wanted = (episode.placed.link,) if episode.placed.joint >= 0 else episode.placed.movable
         episode.right = link in wanted
@@ -303,7 +347,7 @@ def _pull(
         ways = [episodes[k].sense * _true_way(episodes[k], states[k], held[k]) for k in going]
     else:
         seen = [look(episodes[k], states[k], held[k], options, points, seed) for k in going]
-        flows = _decide(seen, flow_of, points)
+        flows = _decide([episodes[k] for k in going], seen, flow_of)
         ways = [_at_held(one, flow, held[k]) for k, one, flow in zip(going, seen, flows, strict=True)]
         ways = [episodes[k].sense * way for k, way in zip(going, ways, strict=True)]
         if learn:
@@ -331,7 +375,7 @@ def _learned(episode: Episode, held: NDArray[np.float64], way: NDArray[np.float6
     episode.before, motion = held, episode.motion
     way = way / max(float(np.linalg.norm(way)), 1e-9)
     if motion is None:
-        normal = _normal(seen, held)
+        normal = seen_normal(seen, held)
         across = np.cross(way, normal)
         tries = (way, episode.sense * normal, -way, across, -across)
         return tries[episode.stuck % len(tries)]
@@ -340,7 +384,7 @@ def _learned(episode: Episode, held: NDArray[np.float64], way: NDArray[np.float6
     return (along, motion, -motion)[episode.stuck % 3]
 
 
-def _normal(seen: Seen, held: NDArray[np.float64]) -> NDArray[np.float64]:
+def seen_normal(seen: Seen, held: NDArray[np.float64]) -> NDArray[np.float64]:
     """The unit normal [3] of the seen surface around a point, towards the camera."""
     points = seen.points[seen.links >= 0].astype(np.float64)
     near = points[np.linalg.norm(points - held, axis=1).argsort()[:NEIGHBORS]]

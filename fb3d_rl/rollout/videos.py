@@ -41,7 +41,7 @@ def _title(film: Film) -> str:
 
 
 def _state(film: Film, t: int) -> str:
-    return f"step {t} · {100 * film.opened[t]:.0f} % opened"
+    return f"{film.moment(t)} · {100 * film.opened[t]:.0f} % {film.aim[0]}"
 
 
 def _draw_actors(draw: ImageDraw.ImageDraw, film: Film, box: tuple[int, int, int, int], until: int) -> None:
@@ -135,15 +135,29 @@ def film_trials(
         options: the task's constants.
         progress: called with the number of films that are done and of all films.
     """
+    by_id = {obj.id: obj for obj in objects}
+
+    def again(row: TrialRow) -> Film:
+        return record(row.policy, policies[row.policy], by_id[row.object], scheduled[row.trial].trial, options)
+
+    write_films(folder, rows, count, again, progress)
+
+
+def write_films(
+    folder: Path,
+    rows: Sequence[TrialRow],
+    count: int,
+    again: Callable[[TrialRow], Film],
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """As :func:`film_trials`, of trials that ``again`` runs and films."""
     chosen = set(trials_to_film(rows, count))
     wanted = [row for row in rows if row.trial in chosen and row.status == "ok"]
-    by_id = {obj.id: obj for obj in objects}
     views: dict[int, View] = {}
     folder.mkdir(parents=True, exist_ok=True)
     for done, row in enumerate(wanted):
         progress(done, len(wanted))
-        film = record(row.policy, policies[row.policy], by_id[row.object], scheduled[row.trial].trial, options)
-        name = film_name(row)
+        film, name = again(row), film_name(row)
         # All policies are seen from the same side.
         if row.trial not in views:
             views[row.trial] = Shot(film, *SIZE).view

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.umpnet import scheduled
@@ -22,11 +23,13 @@ from fb3d_rl.env.umpnet.scenes import JointState, Placed, Scene, bullet_order, p
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.umpnet import DETAILS, read_details
 from fb3d_rl.policies.baselines import random_policy
-from fb3d_rl.policies.flow_policy import expert_policy
+from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.pulling import flow_of
-from fb3d_rl.rollout.rows import NEVER_TOUCHED, read_trials
+from fb3d_rl.report.run_page import write_report
+from fb3d_rl.rollout.rows import NEVER_TOUCHED, film_name, read_trials
 from fb3d_rl.rollout.umpnet import BUDGETS, Episode, run_episodes
+from fb3d_rl.rollout.umpnet_film import PICTURES, film_scene
 
 LIMITS = VelocityLimits(1.0, 1.0, 0.05)
 TRUTH = UmpnetOptions(mask="target")
@@ -177,6 +180,84 @@ def test_the_command_writes_rows_and_tables_and_goes_on(config: Callable[..., An
     assert again == rows and (tmp_path / DETAILS).read_text() == details
     with pytest.raises(UserError, match="another folder"):
         run_evaluation(config("evaluate", [*words, "resume=true", "seed=1"]), tmp_path)
+
+
+class Counting:
+    """A policy of somebody's own with a memory: it follows the true flow, and counts its decisions."""
+
+    in_keys = [("privileged", "flow"), ("observation", "points"), ("count", "made")]
+
+    def initial_state(self, batch: torch.Size) -> TensorDict:
+        return TensorDict({"count": TensorDict({"made": torch.zeros(*batch, 1)}, batch)}, batch)
+
+    def __call__(self, seen: TensorDictBase) -> TensorDictBase:
+        made = seen["count", "made"]
+        # What it does depends on its memory: without one it would never pull back.
+        sign = torch.where(made > 2, -1.0, 1.0)
+        seen["prediction", "flow"] = sign[..., None] * seen["privileged", "flow"]
+        seen["action"] = torch.zeros(len(seen), 8)
+        seen["next", "count"] = TensorDict({"made": made + 1}, seen.batch_size)
+        return seen
+
+
+def make_counting(limits: VelocityLimits, options: FlowPolicyOptions) -> Counting:
+    return Counting()
+
+
+def make_acting(limits: VelocityLimits, options: FlowPolicyOptions) -> Callable[[TensorDictBase], torch.Tensor]:
+    return lambda seen: torch.zeros(len(seen), 8)
+
+
+SMALL = [
+    "protocol=umpnet", "assets.categories=[Laptop]", "assets.eval_count=1", "evaluation.trials=2",
+    "umpnet.mask=target", "collector=direct", "data.points=300", "policy.name=plugin", "evaluation.expert=false",
+]  # fmt: skip
+
+
+def test_a_policy_of_somebodys_own_runs_on_the_scenes(config: Callable[..., Any], tmp_path: Path) -> None:
+    rows = run_evaluation(config("evaluate", [*SMALL, f"policy.target={__name__}:make_counting"]), tmp_path)
+    assert [row.policy for row in rows] == ["plugin_privileged"] * 2 and all(row.contact for row in rows)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["policy_target"] == f"{__name__}:make_counting" and summary["privileged_inputs"] == ["flow"]
+    for detail in read_details(tmp_path / DETAILS):
+        ways = np.diff(detail.values)  # the touch is the first decision: two pulls there, then back
+        assert ways[0] * ways[1] > 0 and ways[2] * ways[1] < 0
+    with pytest.raises(UserError, match="plugin writes no flow"):
+        run_evaluation(config("evaluate", [*SMALL, f"policy.target={__name__}:make_acting"]), tmp_path / "acting")
+
+
+def test_a_film_is_the_episode(placed: list[Placed]) -> None:
+    """It begins in front of the point, holds it after the first second, and shows each pull's end."""
+    for policy, expert in ((expert_policy(LIMITS), True), (random_policy(LIMITS), False)):
+        flow = flow_of(policy, "any")
+        for one in placed[:2]:
+            episode = run_episodes([one], flow, TRUTH, 300, 0, expert)[0]
+            film = film_scene("any", one, flow, TRUTH, 300, 0, expert, False, 0.1)
+            assert len(film) == PICTURES * len(episode.values) and film.link == one.link
+            assert film.success == (episode.distance < 0.1)
+            assert not film.attached[: PICTURES - 1].any() and film.attached[PICTURES - 1 :].all() == episode.right
+            ends = film.distance[PICTURES - 1 :: PICTURES]
+            way = abs(episode.values[0] - one.goal[one.joint])
+            assert ends == pytest.approx(np.abs(np.array(episode.values) - one.goal[one.joint]) / way, abs=1e-5)
+            state = one.start.copy()
+            state[one.joint] = episode.values[-1]
+            np.testing.assert_allclose(film.poses[-1][: len(one.posed.obj.links)], one.posed.poses(state), atol=1e-9)
+            # The hand holds the part at the same place of it all the time.
+            held = film.poses[PICTURES - 1 :]
+            apart = np.linalg.inv(held[:, one.link]) @ held[:, -1]
+            assert np.ptp(apart, axis=0).max() < 1e-6
+            hand = np.linalg.norm(film.tips[:, None] - film.points[:, film.part[0]][:1], axis=-1).min(1)
+            assert hand[PICTURES - 1] < 1e-3 and hand[0] > 0.1
+
+
+def test_scenes_are_filmed_and_on_the_page(config: Callable[..., Any], tmp_path: Path) -> None:
+    words = [*SMALL, f"policy.target={__name__}:make_counting", "evaluation.videos=1"]
+    rows = run_evaluation(config("evaluate", words), tmp_path)
+    names = {path.name for path in (tmp_path / "videos").iterdir()}
+    film = film_name(rows[0]), film_name(rows[1])
+    assert len(names) == 2 and names <= {f"{name}.{suffix}" for name in film for suffix in ("mp4", "png")}
+    page = write_report(tmp_path).read_text()
+    assert "Table III: success" in page and "train categories, class mean" in page
 
 
 def test_other_commands_refuse_the_protocol(config: Callable[..., Any]) -> None:

@@ -65,16 +65,24 @@ def balance(wanted: Tensor, tangent: Tensor) -> Tensor:
     return motion.gather(1, middle).squeeze(1)
 
 
-def stroke(paths: Paths, start: Tensor, direction: Tensor) -> Tensor:
-    """Joint positions [B] after one pull from ``start`` [B] along unit directions [B, 3] of UMPNet's world."""
+def stroke(paths: Paths, start: Tensor, direction: Tensor, coarse: int = 1) -> Tensor:
+    """Joint positions [B] after one pull.
+
+    Args:
+        paths: the held points' paths.
+        start: joint positions [B] before it.
+        direction: unit directions [B, 3] of UMPNet's world.
+        coarse: so many of the simulation's steps are made at once, which is as many times as fast; the end of a pull is
+            the same to some mm.
+    """
     q, still = start.clone(), torch.zeros(len(start), dtype=torch.int64)
     target = paths.at(q)[0] + STROKE * direction
-    for step in range(STEPS):
+    for step in range(STEPS // coarse):
         point, tangent = paths.at(q)
-        moved = (q + balance(GAIN * (target - point), tangent)).clamp(paths.low, paths.high)
+        moved = (q + balance(coarse * GAIN * (target - point), tangent)).clamp(paths.low, paths.high)
         moved = torch.where(still < STILLS, moved, q)
         if step:  # PyBullet's first step has no earlier position to compare with
-            still += (moved - q).abs() * tangent.norm(dim=1) < STILL
+            still += (moved - q).abs() * tangent.norm(dim=1) < coarse * STILL
         q = moved
         if bool((still >= STILLS).all()):
             break
