@@ -17,10 +17,12 @@ from torch import Tensor
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.baselines import RandomPolicy
 from fb3d_rl.policies.flow_policy import FlowPolicy
+from fb3d_rl.policies.flow_state import PULL, SELECT
 from fb3d_rl.policies.interaction import uniform
 from fb3d_rl.policies.policy import initial_state
 
 PREDICTED = ("prediction", "flow")
+PHASE = ("policy", "phase")
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,14 @@ def flow_of(policy: TensorDictModuleBase, name: str) -> FlowOf:
         return FlowOf(lambda seen: seen[key])
     if isinstance(policy, TensorDictSequential) and isinstance(policy.module[-1], FlowPolicy):
         key, before = policy.module[-1].flow_key, TensorDictSequential(*policy.module[:-1])
-        return FlowOf(lambda seen: before(seen)[key], initial_state(before, torch.Size([])))
+
+        def followed(seen: TensorDictBase) -> Tensor:
+            if PHASE in before.in_keys:  # arcs are found while a part is pulled
+                seen[PHASE] = torch.where(seen["observation", "attached"], PULL, SELECT)
+            flow: Tensor = before(seen)[key]
+            return flow
+
+        return FlowOf(followed, initial_state(before, torch.Size([])))
 
     def written(seen: TensorDictBase) -> Tensor:
         flow = policy(seen).get(PREDICTED, None)

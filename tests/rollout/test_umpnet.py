@@ -26,6 +26,7 @@ from fb3d_rl.policies.baselines import random_policy
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.pulling import flow_of
+from fb3d_rl.registry import REGISTRY, behind
 from fb3d_rl.report.run_page import write_report
 from fb3d_rl.rollout.rows import NEVER_TOUCHED, film_name, read_trials
 from fb3d_rl.rollout.umpnet import BUDGETS, Episode, run_episodes
@@ -180,6 +181,22 @@ def test_the_command_writes_rows_and_tables_and_goes_on(config: Callable[..., An
     assert again == rows and (tmp_path / DETAILS).read_text() == details
     with pytest.raises(UserError, match="another folder"):
         run_evaluation(config("evaluate", [*words, "resume=true", "seed=1"]), tmp_path)
+
+
+FITTED = [name for name, entry in REGISTRY.items() if entry.options == REGISTRY["artflownet"].options]
+
+
+@pytest.mark.parametrize("name", FITTED)
+def test_every_network_that_answers_with_a_flow_acts(name: str, placed: list[Placed]) -> None:
+    """Its pulls are its own: those of another network with other weights lead elsewhere."""
+    kind, ways = behind(REGISTRY[name].algorithm), []
+    for seed in (0, 1):
+        net = kind.network(True, 8, "delayed", torch.Generator().manual_seed(seed)).eval()
+        policy = kind.policy(net, LIMITS, FlowPolicyOptions(learn=False))
+        episodes = run_episodes(placed[:2], flow_of(policy, name), TRUTH, 128, 0)
+        assert all(episode.right and len(episode.values) > 1 for episode in episodes)
+        ways.append([value for episode in episodes for value in episode.values])
+    assert ways[0] != ways[1]
 
 
 class Counting:
