@@ -14,11 +14,11 @@ TRIALS = {
     "expert (true flow), all errors": "expert",
     "ArtFlowNet without mask, all errors (.2 degrees, 2 mm)": "artflownet",
     "the same with one grip and each point's most probable flow": "artflownet_one_grip",
-    "DAgger Oracle, all errors": "dagger_oracle",
+    "DAgger Oracle (12,000 labels), all errors, one trial of each object": "dagger_oracle",
     "surface normal (told the part by a mask), all errors": "normal",
     "random, all errors": "random",
 }
-"""Folders of 70 trials."""
+"""Folders of trials."""
 
 ABLATIONS = {
     "all errors (calibration off by .2 degrees, 2 mm)": "base",
