@@ -58,6 +58,7 @@ NEEDS: dict[tuple[str, str], list[str]] = {
     ("evaluate", "policy/flowbotpp"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/screwnet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/ump_di"): ["checkpoint=checkpoint.pt"],
+    ("evaluate", "policy/umpnet"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/bc"): ["checkpoint=checkpoint.pt"],
     ("evaluate", "policy/dagger"): ["checkpoint=checkpoint.pt"],
 }
@@ -85,7 +86,7 @@ def groups_of(name: str) -> list[str]:
 
 
 def cases() -> list[tuple[str, str]]:
-    further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "bc", "dagger")
+    further = ("random", "normal", "plugin", "expert_arc", "flowbotpp", "screwnet", "ump_di", "umpnet", "bc", "dagger")
     other = {("train", f"policy/{name}") for name in ("expert", *further)}
     other |= {("view", f"policy/{name}") for name in further}
     other |= {(name, f"protocol/{own}") for name in ("train", "view", "serve") for own in ("robot", "umpnet")}
