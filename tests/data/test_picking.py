@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,7 +57,7 @@ def kinds(tmp_path: Path) -> dict[str, Callable[[], TensorDictBase]]:
     buffer.commit()
     stored = empty_rows(tmp_path / "samples", SIZE, 64)
     stored["object"][:] = NUMBERS
-    (tmp_path / "samples" / DONE).write_text("{}")
+    (tmp_path / "samples" / DONE).write_text(json.dumps({"recipe": {}}))
     samples = load_samples(tmp_path / "samples")
     parts = [TensorDictReplayBuffer(storage=TensorStorage(part)) for part in (samples[:3], samples[3:])]
     return {"demonstrations": buffer, "labels": Labels(buffer, 2), "joined": Joined(*parts), "samples": samples}
