@@ -161,7 +161,10 @@ class ArtFlowNetEncoder(nn.Module):
     Its batch norm keeps the statistics that it was published with.
 
     Args:
-        inputs, context, outputs, width: as of :class:`PointNet`; the first of the inputs is the part mask.
+        inputs: as of :class:`PointNet`; the first of them is the part mask.
+        context: likewise.
+        outputs: likewise.
+        width: likewise.
 
     Shapes: as of :class:`PointNet`.
     """

@@ -86,9 +86,12 @@ class Guide(nn.Module):
     """Tells the expert's intention.
 
     Args:
-        inputs, context, width: as of :class:`~fb3d_rl.models.encoders.PointNet`.
+        inputs: as of :class:`~fb3d_rl.models.encoders.PointNet`.
+        context: likewise.
         phases: P, how many phases there are.
-        contact, phase: what :meth:`words` says.
+        width: as of the same.
+        contact: whether :meth:`words` say the contact point.
+        phase: whether they say the phase.
     """
 
     SCALES = (0.02, 0.05, 0.15)
