@@ -16,7 +16,6 @@ TRIALS = {
     "the same with one grip and each point's most probable flow": "artflownet_one_grip",
     "DAgger Oracle (12,000 labels), all errors, one trial of each object": "dagger_oracle",
     "surface normal (told the part by a mask), all errors": "normal",
-    "random, all errors": "random",
 }
 """Folders of trials."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from torch import nn
+from torch import Tensor, nn
 
 from fb3d_rl.models.direction_net import DirectionNet, SearchOptions, directions_at
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
@@ -41,11 +41,19 @@ class DirectionFlow(TensorDictModuleBase):
         points, valid, part, tool_pose, held, flow = (tensordict[key] for key in self.in_keys)
         part = part & valid
         size = torch.where(held, 1.0, flow.norm(dim=-1)).masked_fill(~part, 0.0)
-        distance = (points - tool_pose[:, None, :3]).norm(dim=-1).masked_fill(~part, torch.inf)
-        contact = torch.where(held.squeeze(-1), distance.argmin(-1), size.argmax(-1))
+        contact = pulled_point(size, points, part, tool_pose, held.squeeze(-1))
         direction = directions_at(self.net, points, valid, part, contact, self.options)
         tensordict["prediction", "flow"] = size[..., None] * direction[:, None]
         return tensordict
+
+
+def pulled_point(size: Tensor, points: Tensor, part: Tensor, tool_pose: Tensor, held: Tensor) -> Tensor:
+    """Number [E] of the point at which a pull is asked for.
+
+    If the part is ``held`` [E] it is the part's nearest to the tip, else the one of the largest ``size`` [E, N].
+    """
+    distance = (points - tool_pose[:, None, :3]).norm(dim=-1).masked_fill(~part, torch.inf)
+    return torch.where(held, distance.argmin(-1), size.argmax(-1))
 
 
 def direction_policy(

@@ -13,6 +13,7 @@ from torch.nn import functional
 from fb3d_rl.contract import GOAL_POINTS
 from fb3d_rl.models.direction_net import SearchOptions, best_direction
 from fb3d_rl.models.umpnet import Seen, UmpNet, score
+from fb3d_rl.policies.direction_policy import pulled_point
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.policy import Policy
@@ -75,8 +76,7 @@ class UmpnetFlow(Policy):
         part = observed["part_mask"] & valid
         likely = seen.movable.sigmoid().masked_fill(~part, 0.0)
         held = observed["attached"].squeeze(-1)
-        away = (points - observed["tool_pose"][:, None, :3]).norm(dim=-1).masked_fill(~part, torch.inf)
-        contact = torch.where(held, away.argmin(-1), likely.argmax(-1))
+        contact = pulled_point(likely, points, part, observed["tool_pose"], held)
         banned = _banned(state, tensordict.get(("pull", "moved"), None))
         way = best_pull(self.net, seen, contact, 1.0 if goal is None else -1.0, banned, self.options)
         size = torch.where(held[:, None], part.to(likely), likely)[..., None]

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fb3d_rl.camera.views import View
-from fb3d_rl.drawing.bodies import GRIPPER, STATIC, Body, Part, Placed, link_colors
+from fb3d_rl.drawing.bodies import GRIPPER, STATIC, Body, Part, link_colors
 from fb3d_rl.drawing.camera import Camera
 from fb3d_rl.drawing.caption import CAPTION, Still, captioned, filmstrip, still_width
 from fb3d_rl.drawing.signs import FREE, HOLDING
@@ -120,8 +120,8 @@ class Filmed:
         """Write a PNG of its important moments, side by side."""
         shown = moments(self)
         width = 2 * still_width(len(shown), STRIP_WIDTH)
-        studio, bodies = self._stage((width, 3 * width // 4))
-        stills = [Still(name, self._state(t), studio.picture(self._placed(bodies, t))) for name, t in shown]
+        picture = self._drawing((width, 3 * width // 4))
+        stills = [Still(name, self._state(t), picture(t)) for name, t in shown]
         with replacing(path) as part:
             filmstrip(stills, self.title, STRIP_WIDTH).save(part)
 
@@ -134,17 +134,12 @@ class Filmed:
         return f"{self._told[t][0]:.1f} s · {100 * self._told[t][2]:.0f} % opened"
 
     def _frames(self) -> Iterator[NDArray[np.uint8]]:
-        studio, bodies = self._stage(SHAPE)
+        picture = self._drawing(SHAPE)
         for t, (_, held, opened, said) in enumerate(self._told):
-            picture = studio.picture(self._placed(bodies, t))
-            yield np.asarray(captioned(picture, f"{self.title} · {said}", self._state(t), opened, held))
+            yield np.asarray(captioned(picture(t), f"{self.title} · {said}", self._state(t), opened, held))
 
-    def _placed(self, bodies: Sequence[Body], t: int) -> list[Placed]:
-        cup = self._cups[self._told[t][1]]
-        return [(body, LIFT @ pose) for body, pose in zip([*bodies, cup], self._poses[t], strict=True)]
-
-    def _stage(self, size: tuple[int, int]) -> tuple[Studio, list[Body]]:
-        """What stands still, before a camera with pictures of that size, and what moves."""
+    def _drawing(self, size: tuple[int, int]) -> Callable[[int], NDArray[np.uint8]]:
+        """What draws a moment, in pictures of that size."""
         obj = self.cell.content.obj
         # The posts on the near side would hide what happens.
         boxes = [box_mesh(box) for box in cell() if box.size[2] < 0.5 or box.pose[1, 3] < 0.0]
@@ -152,9 +147,15 @@ class Filmed:
         colors = link_colors(obj, self.cell.content.link)
         links = [Body([Part(link.visuals, color)]) for link, color in zip(obj.links, colors, strict=True)]
         *arm, tip = ArmSight(self.cell.arm).meshes
-        bodies = [Body([Part(meshes, GRIPPER)]) for meshes in arm]
-        self._cups = [Body([Part(tip, color)]) for color in (FREE, HOLDING)]
+        bodies = [*links, *(Body([Part(meshes, GRIPPER)]) for meshes in arm)]
+        free, holding = (Body([Part(tip, color)]) for color in (FREE, HOLDING))
         reach = np.array(SIZE) / 2
         corners = np.array([[*(CENTRE + reach * (a, b)), z] for a in (-1, 1) for b in (-1, 1) for z in (0.0, 0.5)])
         whole = np.concatenate([corners, [[-0.15, 0.0, 0.0], [0.0, 0.0, 0.85]]]) + LIFT[:3, 3]
-        return Studio(Camera.fitting(VIEW, whole, size), still), [*links, *bodies]
+        studio = Studio(Camera.fitting(VIEW, whole, size), still)
+
+        def picture(t: int) -> NDArray[np.uint8]:
+            shown = [*bodies, holding if self._told[t][1] else free]
+            return studio.picture([(body, LIFT @ pose) for body, pose in zip(shown, self._poses[t], strict=True)])
+
+        return picture
