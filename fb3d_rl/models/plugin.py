@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
+from torch import nn
 
 from fb3d_rl.errors import UserError
 from fb3d_rl.models.cloud_network import CloudNetwork
@@ -38,6 +40,13 @@ def own_network(target: str, where: str = "") -> type[CloudNetwork]:
     return kind
 
 
+def has_own_loss(net: nn.Module) -> bool:
+    """Whether a network computes the loss that it is fitted by itself: its ``forward`` takes the true flow, ``target``
+    [B, N, 3], and with it answers with a scalar.
+    """
+    return "target" in inspect.signature(net.forward).parameters
+
+
 def require_flow(net: CloudNetwork, target: str) -> None:
     """Check that a new network answers with flows, learns, and can be made again of its ``arguments``.
 
@@ -50,14 +59,21 @@ def require_flow(net: CloudNetwork, target: str) -> None:
     training = net.training
     net.train()
     kept = {name: value.clone() for name, value in net.state_dict().items()}
+    inputs = (points, valid, valid & (points[..., 0] > 0))
     try:
-        flow = net(points, valid, valid & (points[..., 0] > 0))
+        flow = net(*inputs)
         shape = list(getattr(flow, "shape", ())) or type(flow).__name__
         if shape != [2, 256, 3]:
             raise UserError(f"{KEY}={target} answers with {shape}: the flow [B, N, 3] of points [B, N, 3] is needed")
         if not bool(flow.isfinite().all()):
             raise UserError(f"{KEY}={target} answers with a flow that is not finite")
-        if not flow.requires_grad:
+        if has_own_loss(net):
+            loss = net(*inputs, target=torch.randn(points.shape, generator=generator) * inputs[2][..., None])
+            if getattr(loss, "shape", None) != ():
+                raise UserError(f"{KEY}={target} takes a target, but does not answer with a loss, a scalar")
+            if not bool(loss.isfinite()) or not loss.requires_grad:
+                raise UserError(f"{KEY}={target} answers with a loss that is not finite or depends on no weight")
+        elif not flow.requires_grad:
             raise UserError(f"{KEY}={target} answers with a flow that no weight has a part in: it cannot be trained")
         kind: Any = type(net)
         kind(**net.arguments).load_state_dict(net.state_dict())

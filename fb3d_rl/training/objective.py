@@ -11,14 +11,18 @@ from torch.nn.parallel import DistributedDataParallel
 
 from fb3d_rl.models.artflownet import Hypotheses, proposes_several
 from fb3d_rl.models.cloud_network import CloudNetwork
+from fb3d_rl.models.plugin import has_own_loss
 from fb3d_rl.training.device import products_of
-from fb3d_rl.training.draws import augment
+from fb3d_rl.training.draws import augment, generator, global_draws
 from fb3d_rl.training.graph import GraphedLoss
 from fb3d_rl.training.hypotheses import hypotheses_loss
 from fb3d_rl.training.options import FitOptions
 
 Objective: TypeAlias = "Callable[[TensorDictBase, int], Tensor]"
 """The loss of a batch of rows [B] in step number k, a scalar."""
+
+OWN_LOSS = 8
+"""Purpose of the random numbers of a network's own loss, see :func:`fb3d_rl.training.draws.generator`."""
 
 
 def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
@@ -34,10 +38,20 @@ def flow_loss(predicted: Tensor, target: Tensor, valid: Tensor) -> Tensor:
 def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(None)) -> Objective:
     """The loss of a flow network (:func:`cloud_loss`) on clouds that are augmented according to the options.
 
+    A network with a loss of its own may draw random numbers for it, which depend on the seed and the step alone.
+
     ``share`` is the part of the whole batch that the objective is called with. On a GPU with ``options.graph``, forward
     and backward are one launch (:class:`~fb3d_rl.training.graph.GraphedLoss`), if the network can do so.
     """
     loss = cloud_loss(model, options)
+    if has_own_loss(_network(model)):
+
+        def own(batch: TensorDictBase, step: int) -> Tensor:
+            device = batch["observation", "points"].device
+            with global_draws(generator(options.seed, OWN_LOSS, step), device):
+                return loss(augment(batch, options, step, share))
+
+        return own
     if (
         options.graph
         and not options.compile
@@ -54,20 +68,27 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
 
 
 def cloud_loss(model: nn.Module, options: FitOptions) -> Callable[[TensorDictBase], Tensor]:
-    """:func:`flow_loss` of a flow network on flow samples [B], and
-    :func:`~fb3d_rl.training.hypotheses.hypotheses_loss` of one that proposes several flows.
+    """:func:`flow_loss` of a flow network on flow samples [B],
+    :func:`~fb3d_rl.training.hypotheses.hypotheses_loss` of one that proposes several flows, or the network's own.
     """
-    network = model.module if isinstance(model, DistributedDataParallel) else model
-    several = proposes_several(network)
+    several, own = proposes_several(_network(model)), has_own_loss(_network(model))
 
     def loss(batch: TensorDictBase) -> Tensor:
         points, valid = batch["observation", "points"], batch["observation", "valid"]
         inputs, target = (points, valid, batch["observation", "part_mask"]), batch["privileged", "flow"]
         with products_of(options, points.device):
+            if own:
+                found: Tensor = model(*inputs, target=target)
+                return found
             predicted = model(*inputs, propose=True) if several else model(*inputs)
         if not several:
             return flow_loss(predicted.float(), target, valid)
-        found = Hypotheses(predicted.flows.float(), predicted.log_probabilities.float())
-        return hypotheses_loss(found, target, valid, batch["privileged", "link"])
+        proposed = Hypotheses(predicted.flows.float(), predicted.log_probabilities.float())
+        return hypotheses_loss(proposed, target, valid, batch["privileged", "link"])
 
     return loss
+
+
+def _network(model: nn.Module) -> nn.Module:
+    """The network that processes share."""
+    return model.module if isinstance(model, DistributedDataParallel) else model

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -82,6 +83,32 @@ class Forgetful(PerPoint):
         self.further = nn.Linear(width if generator is None else 5, 1)
 
 
+class OwnLoss(PerPoint):
+    """Absolute errors, of a part of the points that is drawn anew in each step."""
+
+    def __init__(self, part_mask_input=True, neighbors=64, backbone="pointnet2", generator=None):
+        super().__init__(part_mask_input, neighbors, backbone, generator)
+        if generator is not None:
+            for weight in self.parameters():
+                nn.init.normal_(weight, 0.0, 0.3, generator)
+
+    def forward(self, points, valid, part_mask=None, target=None):
+        flow = super().forward(points, valid, part_mask)
+        if target is None:
+            return flow.detach()
+        return ((flow - target).abs().sum(2) * (torch.rand(valid.shape) < 0.5) * valid).sum() / valid.sum()
+
+
+class NoScalar(PerPoint):
+    def forward(self, points, valid, part_mask=None, target=None):
+        return super().forward(points, valid, part_mask)
+
+
+class NoGradient(OwnLoss):
+    def forward(self, points, valid, part_mask=None, target=None):
+        return super().forward(points, valid, part_mask, target).detach()
+
+
 def function():
     pass
 '''
@@ -107,7 +134,7 @@ def forget(folder: Path) -> None:
     sys.path[:] = [place for place in sys.path if place != str(folder)]
 
 
-@pytest.mark.parametrize("name", ["PerPoint", "Half"])
+@pytest.mark.parametrize("name", ["PerPoint", "Half", "OwnLoss"])
 def test_it_is_trained_saved_and_evaluated_by_its_name(
     folder: Path, config: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
@@ -140,6 +167,19 @@ def test_it_is_trained_saved_and_evaluated_by_its_name(
             acting("artflownet", str(path))
 
 
+def test_a_loss_of_its_own_is_fitted_and_its_draws_repeat(folder: Path, config: Callable[..., Any]) -> None:
+    words = [*SMALL, "algo.network=my_networks:OwnLoss", "evaluation.trials=0", "algo.log_every=1"]
+    digests = []
+    for name, seed in (("first", 0), ("again", 0), ("other", 1)):
+        torch.rand(7)  # wherever the global generator stands
+        run_training(config("train", [*words, f"algo.seed={seed}"]), folder / name)
+        digests.append(load_trained(folder / name, ArtFlowNet).digest())
+        rows = [json.loads(line) for line in (folder / name / "metrics.jsonl").read_text().splitlines()]
+        losses = [row["train/loss"] for row in rows if "train/loss" in row]
+        assert losses[-1] < losses[0]
+    assert digests[0] == digests[1] != digests[2]
+
+
 def test_the_best_weights_name_the_class(folder: Path, config: Callable[..., Any]) -> None:
     words = [*SMALL, "algo.network=my_networks:PerPoint", "assets.train_count=4", "assets.validation_share=0.3"]
     run_training(config("train", [*words, "evaluation.trials=0", "algo.evaluate_every=2"]), folder / "run")
@@ -162,6 +202,8 @@ def test_the_best_weights_name_the_class(folder: Path, config: Callable[..., Any
         ("my_networks:Wide", r"answers with \[2, 256, 6\]"),
         ("my_networks:Lost", "not finite"),
         ("my_networks:Deaf", "no weight"),
+        ("my_networks:NoScalar", "does not answer with a loss, a scalar"),
+        ("my_networks:NoGradient", "depends on no weight"),
         ("my_networks:Few", "cannot be made: TypeError"),
         ("my_networks:Forgetful", "cannot be used: RuntimeError"),
     ],
