@@ -33,9 +33,10 @@ def squared_distances(points: Tensor, others: Tensor) -> Tensor:
 
     Differences are squared directly: the shorter |a|^2 - 2ab + |b|^2 loses digits on close points.
     """
-    total = (points[:, :, None, 0] - others[:, None, :, 0]).square_()
+    own, other = points.mT.contiguous()[..., None], others.mT.contiguous()[:, :, None]
+    total = (own[:, 0] - other[:, 0]).square_()
     for axis in (1, 2):
-        total += (points[:, :, None, axis] - others[:, None, :, axis]).square_()
+        total += (own[:, axis] - other[:, axis]).square_()
     return total
 
 
@@ -150,10 +151,13 @@ def knn(points: Tensor, queries: Tensor, count: int, valid: Tensor | None = None
     shape = (*queries.shape[:2], count)
     distance = torch.empty(shape, dtype=points.dtype, device=points.device)
     index = torch.empty(shape, dtype=torch.int64, device=points.device)
-    size = 1 if points.device.type == "cpu" else len(points)
+    on_cpu = points.device.type == "cpu"
+    size, whole = (1 if on_cpu else len(points)), on_cpu and bool(valid.all())  # elsewhere asking would wait
     for start in range(0, len(points), size):
         part = slice(start, start + size)
-        squared = squared_distances(queries[part], points[part]).masked_fill_(~valid[part, None], torch.inf)
+        squared = squared_distances(queries[part], points[part])
+        if not whole:
+            squared.masked_fill_(~valid[part, None], torch.inf)
         distance[part], index[part] = squared.topk(count, dim=2, largest=False)
     return distance, index
 

@@ -14,31 +14,56 @@ from fb3d_rl.geometry.points import squared_distances
 FEW = 4
 """Clouds up to which each is sampled on its own; PyTorch does more of them faster together."""
 
+FIRST = 8
+"""Points that are chosen one by one: each of the first changes what is far as a whole."""
+
+CANDIDATES = 128
+"""Points among which several are chosen in a row."""
+
 
 def farthest_point_sample(points: Tensor, count: int, valid: Tensor) -> Tensor:
     """As :func:`fb3d_rl.geometry.points.farthest_point_sample`, of float32 points."""
-    chosen = [_farthest(cloud, count, real) for cloud, real in zip(points.numpy(), valid.numpy(), strict=True)]
+    chosen = [_farthest(cloud, count, real) for cloud, real in zip(points, valid, strict=True)]
     return torch.from_numpy(np.stack(chosen))
 
 
-def _farthest(points: NDArray[np.float32], count: int, valid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    columns, rows = np.ascontiguousarray(points.T), np.ascontiguousarray(points)[:, :, None]
-    distance = np.where(valid, np.float32(np.inf), np.float32(-1.0))
-    step, squared = np.empty_like(columns), np.empty_like(distance)
-    exact = np.empty((2, len(points)))
-    chosen = np.empty(count, dtype=np.int64)
-    current = valid.argmax()
-    for i in range(count):
-        chosen[i] = current
-        np.subtract(columns, rows[current], out=step)
-        np.multiply(step[0], step[0], out=squared)
-        # PyTorch adds y * y and z * z without rounding them before (fused), which double precision does, too.
-        np.multiply(step[1:], step[1:], out=exact, dtype=np.float64)
-        np.add(squared, exact[0], out=squared, casting="same_kind")
-        np.add(squared, exact[1], out=squared, casting="same_kind")
-        np.minimum(distance, squared, out=distance)
-        current = distance.argmax()
+def _farthest(points: Tensor, count: int, valid: Tensor) -> NDArray[np.int64]:
+    """Of one cloud [N, 3].
+
+    Candidates are the ``CANDIDATES`` points that are the farthest from all chosen ones. It chooses among these alone as
+    long as the farthest of them is farther than any other point was, since distances only become smaller. So what is
+    done with all points is done for many choices at once; most of its time would be that of the calls.
+    """
+    columns = points.T.contiguous()
+    nearest = torch.where(valid, torch.inf, -1.0)  # from each point to the nearest chosen one
+    distance, chosen, done = nearest.numpy(), np.empty(count, dtype=np.int64), 0
+    while done < count:
+        bound, candidates = np.float32(-1.0), np.array([valid.numpy().argmax() if done == 0 else distance.argmax()])
+        if done >= FIRST:
+            if len(distance) > CANDIDATES:
+                bound = np.partition(distance, -CANDIDATES)[-CANDIDATES]
+            candidates = above if len(above := np.flatnonzero(distance > bound)) else candidates
+        own, rows = distance[candidates], columns[:, candidates]
+        between, begun, best = _between(rows, rows).numpy(), done, own.argmax()
+        while True:
+            chosen[done], done = best, done + 1
+            np.minimum(own, between[best], out=own)
+            best = own.argmax()
+            if done == count or own[best] <= bound or len(own) == 1:
+                break
+        chosen[begun:done] = candidates[chosen[begun:done]]
+        torch.minimum(nearest, _between(columns[:, chosen[begun:done]], columns).amin(0), out=nearest)
     return chosen
+
+
+def _between(points: Tensor, others: Tensor) -> Tensor:
+    """Squared distances [M, N] between points [3, M] and others [3, N], rounded as PyTorch's sampling rounds them."""
+    step = points[0][:, None] - others[0]
+    total = step * step
+    for axis in (1, 2):
+        torch.sub(points[axis][:, None], others[axis], out=step)
+        total.addcmul_(step, step)
+    return total
 
 
 def ball_query(points: Tensor, centres: Tensor, radius: float, count: int, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,21 +72,24 @@ def ball_query(points: Tensor, centres: Tensor, radius: float, count: int, valid
     index = np.empty((clouds, balls, count), dtype=np.int64)
     mask = np.empty((clouds, balls, count), dtype=np.bool_)
     for b in range(clouds):  # one at a time, so that its distances stay in the cache
-        inside = squared_distances(centres[b : b + 1], points[b : b + 1])[0] <= radius * radius
-        _first(inside.logical_and_(valid[b]).numpy(), index[b], mask[b])
+        inside = squared_distances(centres[b : b + 1], points[b : b + 1])[0].numpy() <= radius * radius
+        if not valid[b].all():
+            inside &= valid[b].numpy()
+        _first(inside, index[b], mask[b])
     return torch.from_numpy(index), torch.from_numpy(mask)
 
 
 def _first(inside: NDArray[np.bool_], index: NDArray[np.int64], mask: NDArray[np.bool_]) -> None:
     """Write the first K columns of each row of ``inside`` [M, N] that are True to ``index`` and ``mask`` [M, K]."""
     found = np.flatnonzero(inside)  # all points inside, ball by ball
-    sizes = np.count_nonzero(inside, axis=1)
-    begins = (np.cumsum(sizes) - sizes)[:, None]
+    balls, size = inside.shape
+    bounds = np.searchsorted(found, size * np.arange(balls + 1))  # where each ball's points begin
+    sizes, begins = np.diff(bounds), bounds[:-1, None]
     slots = np.arange(index.shape[1])
     np.less(slots, sizes[:, None], out=mask)
     if len(found) == 0:
         index[:] = 0
         return
     places = np.where(mask, begins + slots, np.minimum(begins, len(found) - 1))
-    np.subtract(found[places], inside.shape[1] * np.arange(len(inside))[:, None], out=index)
+    np.subtract(found[places], size * np.arange(balls)[:, None], out=index)
     index[sizes == 0] = 0

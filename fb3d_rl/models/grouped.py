@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import torch
@@ -52,28 +53,47 @@ class Grouping:
     """Which points lie in which balls, laid out for blockwise work. Balls are sorted by size, largest first.
 
     Attributes:
+        points: P, the number of points.
         order: [Q] the ball at each sorted place.
         ball_size: [Q] f32 real neighbours of each ball, at least 1: a centre lies in its own ball.
         ball_start: [Q] each ball's first slot.
         source: [R] the point in each slot.
-        owner: [R] the sorted place of each slot's ball.
         weight: [R] f32: 1, or 0 on a slot that repeats a point only to fill a block.
         blocks: how the balls are cut up.
         pairs: number of weights that are 1.
-        by_point: [R] slots sorted by their point.
-        point_start: [P] where each point's slots begin in by_point.
     """
 
+    points: int
     order: Tensor
     ball_size: Tensor
     ball_start: Tensor
     source: Tensor
-    owner: Tensor
     weight: Tensor
     blocks: list[Block]
     pairs: int
-    by_point: Tensor
-    point_start: Tensor
+
+    # What only a gradient needs is made when it is asked for.
+
+    @cached_property
+    def owner(self) -> Tensor:
+        """[R] the sorted place of each slot's ball."""
+        slots = torch.arange(len(self.source), device=self.source.device)
+        return torch.searchsorted(self.ball_start, slots, right=True) - 1
+
+    @cached_property
+    def _sorted(self) -> tuple[Tensor, Tensor]:
+        by_value, by_point = self.source.sort(stable=True)
+        return by_point, torch.searchsorted(by_value, torch.arange(self.points, device=by_value.device))
+
+    @property
+    def by_point(self) -> Tensor:
+        """[R] slots sorted by their point."""
+        return self._sorted[0]
+
+    @property
+    def point_start(self) -> Tensor:
+        """[P] where each point's slots begin in by_point."""
+        return self._sorted[1]
 
     def weigh(self, rows: Tensor, block: Block) -> Tensor:
         """Rows [slots, C] of a block with repeated slots set to 0."""
@@ -84,7 +104,7 @@ class Grouping:
         if _at_once(table):
             rows = table if slots is None else table[slots]
             rows = rows if weight is None else rows * weight[:, None].to(table.dtype)
-            return table.new_zeros(len(self.point_start), table.shape[1]).index_add_(0, self.source, rows)
+            return table.new_zeros(self.points, table.shape[1]).index_add_(0, self.source, rows)
         index = self.by_point if slots is None else slots[self.by_point]
         share = None if weight is None else weight[self.by_point].to(table.dtype)
         return functional.embedding_bag(index, table, self.point_start, mode="sum", per_sample_weights=share)
@@ -122,14 +142,9 @@ def make_grouping(index: Tensor, mask: Tensor, points: int) -> Grouping:
         weights.append(mask[here, :width].flatten().float())
         starts.append(slot + torch.arange(balls, device=device) * width)
         first, slot = first + balls, slot + balls * width
-    source, ball_start = torch.cat(sources), torch.cat(starts)
-    owner = torch.searchsorted(ball_start, torch.arange(slot, device=device), right=True) - 1
-    by_value, by_point = source.sort(stable=True)
-    point_start = torch.searchsorted(by_value, torch.arange(points, device=device))
     return Grouping(
-        order, ball_size.float(), ball_start, source, owner, torch.cat(weights), blocks, sum(sizes), by_point,
-        point_start,
-    )  # fmt: skip
+        points, order, ball_size.float(), torch.cat(starts), torch.cat(sources), torch.cat(weights), blocks, sum(sizes)
+    )
 
 
 def _fold(mean: Tensor, inverse: Tensor, norm_weight: Tensor, norm_bias: Tensor) -> tuple[Tensor, Tensor]:
