@@ -95,18 +95,6 @@ def labels(below: str) -> Cell:
     return cell
 
 
-def decision_ms(below: str) -> Cell:
-    """A column of the wall time of a decision."""
-
-    def cell(row: Row) -> str:
-        time = summary(f"{below}/{row.folder}").get(f"{row.policy}/time/decision_ms")
-        if time is None:  # the machine did other work
-            return "–"
-        return f"{time:.1f}" if time < 10 else f"{time:.0f}"
-
-    return cell
-
-
 def flow(key: str) -> Cell:
     """A column of a flow metric of the run's network; empty for other policies."""
     return lambda row: _flow_interval(summary(row.folder), key) if row.policy == "artflownet" else ""
@@ -136,15 +124,21 @@ IMITATION = (
 
 POLICIES = (
     Row("expert (true flow)", "expert", "expert"),
+    Row("ArtFlowNet, published weights", "artflownet_published", "artflownet"),
     Row("ArtFlowNet", "artflownet", "artflownet"),
     Row("ArtFlowNet, no part mask", "artflownet_no_mask", "artflownet"),
-    Row("ArtFlowNet, no part mask, any viewpoint", "artflownet_no_mask_vpa", "artflownet"),
+    Row("FlowBot++, a look in every step", "flowbotpp_1", "flowbotpp"),
+    Row("FlowBot++, a look in 3 steps", "flowbotpp_3", "flowbotpp"),
+    Row("FlowBot++, a look in 10 steps", "flowbotpp_10", "flowbotpp"),
+    Row("FlowBot++, one look for each hold", "flowbotpp_open", "flowbotpp"),
     Row("UMP-DI (told where to touch)", "ump_di", "ump_di"),
     Row("screw parameters", "screwnet", "screwnet"),
     Row("surface normal", "normal", "normal"),
     Row("BC", "bc", "bc"),
     Row("BC + F (told the true flow)", "bc_flow", "bc_flow"),
     Row("DAgger E2E", "dagger", "dagger"),
+    Row("DAgger E2E, contact point and phase", "dagger_told", "dagger"),
+    Row("DAgger E2E + published ArtFlowNet's flow", "dagger_predicted", "dagger"),
     Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
     Row("DAgger Oracle (driven to the contact point)", "dagger_oracle", "dagger_oracle"),
     Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
@@ -157,20 +151,25 @@ TWO = (Row("expert (true flow)", "", "expert"), Row("ArtFlowNet", "", "artflowne
 """Both policies of one run, whose folder the columns name."""
 
 
+HEADLINE = ("expert", "artflownet_published", "artflownet", "flowbotpp_10", "screwnet", "bc", "bc_flow", "dagger",
+            "dagger_predicted", "dagger_flow", "dagger_oracle", "dagger_oracle_flow")  # fmt: skip
+"""Folders of those of POLICIES that the first page shows."""
+
+
 def headline() -> Lines:
-    """Three test sets side by side, with the number of trials and objects of each."""
+    """The comparison's four test sets side by side, with the number of trials and objects of each."""
     sets = {
-        "new objects of known kinds": ("imitation", ""),
-        "categories never trained on": ("imitation_unseen", "test"),
-        "real objects (PartNet-Mobility)": ("imitation_partnet_mobility", ""),
+        "real objects of known kinds": "train_test",
+        "real objects of new kinds": "test",
+        "procedural objects of known kinds": "procedural_train_test",
+        "procedural objects of new kinds": "procedural_test",
     }
     columns = {}
-    for name, (folder, split) in sets.items():
-        numbers = summary(f"{folder}/dagger")
-        numbers = numbers["by_split"][split] if split else numbers
-        header = f"{name}: {numbers['n']} trials on {numbers['n_objects']} objects"
-        columns[header] = share("success_rate", folder, split)
-    return trials(IMITATION, columns)
+    for name, split in sets.items():
+        numbers = summary("comparison/expert")["by_split"][split]
+        header = f"{name}: {numbers['n']} trials on {numbers['n_objects']}"
+        columns[header] = share("success_rate", "comparison", split)
+    return trials([row for row in POLICIES if row.folder in HEADLINE], columns)
 
 
 def imitation() -> Lines:
@@ -245,7 +244,6 @@ def comparison() -> Lines:
         "procedural, seen families": share("success_rate", below, "procedural_train_test"),
         "procedural, unseen families": share("success_rate", below, "procedural_test"),
         "contact, all": share("contact_rate", below, interval=False),
-        "ms a decision": decision_ms(below),
     })  # fmt: skip
 
 
@@ -398,6 +396,28 @@ ABLATION = {
 """What was added, one by one, and the runs on real objects and on look-alike doors."""
 
 
+ANSWERS = {
+    "one answer": ("comparison/artflownet", "artflownet"),
+    "four answers, the winner takes all": ("ablation/four_answers", "artflownet"),
+    "eight draws of flow matching": ("ablation/flow_matching", "flow_matching"),
+}
+"""Heads on the same encoder, fitted to the same clouds: a run of each, and its policy."""
+
+
+def answers() -> Lines:
+    """Flow and success on real objects of networks that differ in how many answers they give."""
+    body = []
+    for name, (folder, policy) in ANSWERS.items():
+        numbers, row = summary(folder)["by_split"], Row(name, folder, policy)
+        body.append([
+            name,
+            *(_two_means(numbers["test"], f"flow/{key}") for key in ("cosine", "axis_cosine", "best_cosine", "rmse")),
+            *(share("success_rate", split=split)(row) for split in ("train_test", "test")),
+        ])  # fmt: skip
+    head = ["", "flow cosine, test", "of the axis", "of the best answer", "RMSE", "opened, train_test", "opened, test"]
+    return table(head, body)
+
+
 def ablation() -> Lines:
     """Success on real objects and on look-alike doors after each addition."""
     body = []
@@ -451,7 +471,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     for function in (
         headline, imitation, imitation_unseen, imitation_partnet_mobility, imitation_contact, comparison,
         procedural, partnet_mobility,
-        flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
+        flow_published, transfer, transfer_categories, pretrained, touch, ablation, answers, learning_curve,
         learning_curve_seeds, robot, robot_ablation,
     )
 }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fb3d_rl.camera.noise import PRESETS, TERMS, DepthNoiseOptions
+from fb3d_rl.camera.noise_options import PRESETS, TERMS, DepthNoiseOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.options import option
 
