@@ -4,11 +4,12 @@
 # make check   lint, types and import rules
 # make docs    the documentation, into site/
 # make lock    pin the dependencies anew
+# make install-training   .venv without the simulator: trains flow networks and predicts
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install train test slow check docs lock clean
+.PHONY: install install-training train test slow check docs lock clean
 
 install: $(VENV)/installed
 
@@ -42,6 +43,15 @@ extra-%: $(VENV)/installed
 	grep -v "^opencv" requirements.lock > $(VENV)/constraints.txt
 	$(BIN)/python -c '$(EXTRA)' $* > $(VENV)/extra-$*.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(VENV)/constraints.txt -r $(VENV)/extra-$*.txt
+
+# What trains flow networks and predicts, without the simulator and the tests' packages.
+NEEDED = from pip._vendor import tomli; [print(line) for line in tomli.load(open("pyproject.toml", "rb"))["project"]["dependencies"] \
+  if not line.startswith(("sapien", "mani-skill"))]
+install-training:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -c '$(NEEDED)' > $(VENV)/training.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock -r $(VENV)/training.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --editable .
 
 # mani-skill asks for opencv-python, whose window toolkit needs the system's libGL and glib; the headless build of the
 # same version is the same module without it. Reinstalled, because the two share files, which go with the former.

@@ -620,6 +620,14 @@ def test_every_command_is_documented_and_a_wrong_one_not_understood(
 
 
 def test_documented_targets_of_make_are_there() -> None:
-    targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    named = {target for path in TEXTS for target in re.findall(r"(?:^|`)make (\w+)", path.read_text(), re.MULTILINE)}
-    assert {"train", "test", "check"} <= named <= {*targets}
+    targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    named = {word for path in TEXTS for word in re.findall(r"(?:^|`)make ([\w-]+)", path.read_text(), re.MULTILINE)}
+    assert {"train", "test", "check", "install-training"} <= named <= {*targets}
+
+
+def test_what_training_needs_is_all_but_the_simulator() -> None:
+    lines = subprocess.run(["make", "-n", "install-training"], cwd=ROOT, check=True, capture_output=True, text=True)
+    [program] = re.findall(r"-c '(.+?)' >", lines.stdout.replace("\\\n", ""))
+    found = subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, capture_output=True, text=True)
+    names = {re.split(r"[=<>;]", line)[0] for line in found.stdout.split("\n") if line}
+    assert {"torch", "torchrl", "trimesh", "hydra-core"} <= names and not names & {"sapien", "mani-skill"}
