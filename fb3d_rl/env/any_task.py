@@ -123,6 +123,8 @@ def make_task(
     import gymnasium
     import mani_skill.envs  # noqa: F401, it registers the tasks
 
+    if sees == "state":
+        _allow_materials()
     given = {"obs_mode": "state_dict", "render_backend": "none"} if sees == "state" else {"obs_mode": "pointcloud"}
     try:
         # Built anew for each episode: what an episode leaves behind, such as a grasp, is felt at the start of the next.
@@ -142,3 +144,24 @@ def make_task(
     except (Exception, SystemExit) as error:  # noqa: BLE001, it is code of others
         raise UserError(f"expert.target={target} fails: {said(error)}") from error
     return TaskEnv(env, expert, target, points if sees == "points" else 0)
+
+
+class _Material:
+    """Stands in for a material that nobody draws."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        pass
+
+
+def _allow_materials() -> None:
+    """Let tasks name the materials of what they build on machines without Vulkan, too, where SAPIEN makes none: with
+    ``render_backend=none`` they are never drawn.
+    """
+    import sapien.pysapien
+    import sapien.render
+
+    try:
+        sapien.render.RenderMaterial()
+    except RuntimeError:  # there is no rendering device
+        for module in (sapien.render, sapien.pysapien.render):
+            module.RenderMaterial = _Material

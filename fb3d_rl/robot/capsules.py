@@ -8,6 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
+from trimesh.intersections import slice_faces_plane
 
 from fb3d_rl.assets.articulation import Mesh
 
@@ -52,10 +53,12 @@ def _halved(surface: trimesh.Trimesh, splits: int) -> list[Capsule]:
     axis = whole.ends[1] - whole.ends[0]
     if splits == 0 or not axis.any():
         return [whole]
-    halves = [surface.slice_plane(whole.ends.mean(0), way) for way in (axis, -axis)]
-    if min(len(half.vertices) for half in halves) < 4:
+    # Trimesh's own slice_plane wants shapely, for caps that are not needed here.
+    halves = [slice_faces_plane(surface.vertices, surface.faces, way, whole.ends.mean(0))[:2] for way in (axis, -axis)]
+    if min(len(vertices) for vertices, _ in halves) < 4:
         return [whole]
-    parts = [capsule for half in halves for capsule in _halved(half, splits - 1)]
+    surfaces = [trimesh.Trimesh(vertices, faces, process=False) for vertices, faces in halves]
+    parts = [capsule for half in surfaces for capsule in _halved(half, splits - 1)]
     return parts if sum(part.volume for part in parts) < WORTHWHILE * whole.volume else [whole]
 
 
