@@ -125,8 +125,8 @@ IMITATION = (
 POLICIES = (
     Row("expert (true flow)", "expert", "expert"),
     Row("ArtFlowNet, published weights", "artflownet_published", "artflownet"),
+    Row("ArtFlowNet, published weights, no part mask", "artflownet_published_unmasked", "artflownet"),
     Row("ArtFlowNet", "artflownet", "artflownet"),
-    Row("ArtFlowNet, no part mask", "artflownet_no_mask", "artflownet"),
     Row("FlowBot++, a look in every step", "flowbotpp_1", "flowbotpp"),
     Row("FlowBot++, a look in 3 steps", "flowbotpp_3", "flowbotpp"),
     Row("FlowBot++, a look in 10 steps", "flowbotpp_10", "flowbotpp"),
@@ -142,7 +142,6 @@ POLICIES = (
     Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
     Row("DAgger Oracle (driven to the contact point)", "dagger_oracle", "dagger_oracle"),
     Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
-    Row("random", "random", "random"),
 )
 """results/comparison."""
 
@@ -396,28 +395,6 @@ ABLATION = {
 """What was added, one by one, and the runs on real objects and on look-alike doors."""
 
 
-ANSWERS = {
-    "one answer": ("comparison/artflownet", "artflownet"),
-    "four answers, the winner takes all": ("ablation/four_answers", "artflownet"),
-    "eight draws of flow matching": ("ablation/flow_matching", "flow_matching"),
-}
-"""Heads on the same encoder, fitted to the same clouds: a run of each, and its policy."""
-
-
-def answers() -> Lines:
-    """Flow and success on real objects of networks that differ in how many answers they give."""
-    body = []
-    for name, (folder, policy) in ANSWERS.items():
-        numbers, row = summary(folder)["by_split"], Row(name, folder, policy)
-        body.append([
-            name,
-            *(_two_means(numbers["test"], f"flow/{key}") for key in ("cosine", "axis_cosine", "best_cosine", "rmse")),
-            *(share("success_rate", split=split)(row) for split in ("train_test", "test")),
-        ])  # fmt: skip
-    head = ["", "flow cosine, test", "of the axis", "of the best answer", "RMSE", "opened, train_test", "opened, test"]
-    return table(head, body)
-
-
 def ablation() -> Lines:
     """Success on real objects and on look-alike doors after each addition."""
     body = []
@@ -471,7 +448,7 @@ TABLES: dict[str, Callable[[], Lines]] = {
     for function in (
         headline, imitation, imitation_unseen, imitation_partnet_mobility, imitation_contact, comparison,
         procedural, partnet_mobility,
-        flow_published, transfer, transfer_categories, pretrained, touch, ablation, answers, learning_curve,
+        flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
         learning_curve_seeds, robot, robot_ablation,
     )
 }  # fmt: skip
