@@ -138,7 +138,7 @@ POLICIES = (
     Row("BC + F (told the true flow)", "bc_flow", "bc_flow"),
     Row("DAgger E2E", "dagger", "dagger"),
     Row("DAgger E2E, contact point and phase", "dagger_told", "dagger"),
-    Row("DAgger E2E + published ArtFlowNet's flow", "dagger_predicted", "dagger"),
+    Row("DAgger E2E + published ArtFlowNet's flow", "dagger_predicted", "dagger_artflow"),
     Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
     Row("DAgger Oracle (driven to the contact point)", "dagger_oracle", "dagger_oracle"),
     Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
