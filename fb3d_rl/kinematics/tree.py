@@ -107,6 +107,10 @@ class KinematicTree:
     def forward(self, qpos: Tensor) -> Tensor:
         """Link poses T_base_link [..., L, 4, 4] at joint states ``qpos`` [..., J] (rad or m)."""
         qpos = qpos.to(self.origins.dtype)
+        if qpos.dim() == 1:
+            # As in a batch: on some processors PyTorch multiplies single matrices by a routine that rounds otherwise.
+            alone: Tensor = self.forward(qpos[None])[0]
+            return alone
         batch = qpos.shape[:-1]
         eye = torch.eye(3, dtype=qpos.dtype, device=qpos.device)
         poses: list[Tensor] = []
