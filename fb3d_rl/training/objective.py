@@ -43,17 +43,10 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
     ``share`` is the part of the whole batch that the objective is called with. On a GPU with ``options.graph``, forward
     and backward are one launch (:class:`~fb3d_rl.training.graph.GraphedLoss`), if the network can do so.
     """
-    loss = cloud_loss(model, options)
-    if has_own_loss(_network(model)):
-
-        def own(batch: TensorDictBase, step: int) -> Tensor:
-            device = batch["observation", "points"].device
-            with global_draws(generator(options.seed, OWN_LOSS, step), device):
-                return loss(augment(batch, options, step, share))
-
-        return own
+    loss, own = cloud_loss(model, options), has_own_loss(_network(model))
     if (
         options.graph
+        and not own
         and not options.compile
         and isinstance(model, CloudNetwork)
         and getattr(getattr(model, "network", None), "FIXED_SHAPES", False)  # one of the user's own may have any layers
@@ -62,7 +55,11 @@ def flow_objective(model: nn.Module, options: FitOptions, share: slice = slice(N
         loss = GraphedLoss(model, loss)
 
     def objective(batch: TensorDictBase, step: int) -> Tensor:
-        return loss(augment(batch, options, step, share))
+        clouds = augment(batch, options, step, share)
+        if not own:
+            return loss(clouds)
+        with global_draws(generator(options.seed, OWN_LOSS, step), clouds["observation", "points"].device):
+            return loss(clouds)
 
     return objective
 
