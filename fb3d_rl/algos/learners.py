@@ -21,11 +21,12 @@ from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.gates import PREDICTED, make_gate
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, EitherGate, Gate, InteractivePolicy, OracleGate
-from fb3d_rl.policies.learner import INPUTS, Learner, intention_of, rotated, turning
+from fb3d_rl.policies.learner import INPUTS, Learner, hand_in, intention_of, rotated, turning
 from fb3d_rl.policies.options import LearnerOptions
 from fb3d_rl.seeds import derived
 from fb3d_rl.training.draws import generator, global_draws
 from fb3d_rl.training.objective import Objective
+from fb3d_rl.training.processes import rank_and_count
 
 if TYPE_CHECKING:
     from fb3d_rl.algos.options import ImitationOptions, SamplingOptions
@@ -167,31 +168,38 @@ def _guided(member: Learner, inputs: TensorDictBase, rows: TensorDictBase, matri
         rows: the rows [B].
         matrix: see above.
     """
-    told, (true, goes) = member.network.told(inputs), intention_of(rows)
+    network, options, felt = member.network, member.options, inputs["felt"]
+    told, (true, goes) = network.told(*(inputs[key] for key in INPUTS)), intention_of(rows)
     contact, standoff = (torch.einsum("bij,bj->bi", matrix, vector) for vector in (true.contact, true.standoff))
-    true, own = Intention(contact, standoff, true.phase), told.intention()
-    contact, standoff = (
-        torch.where(goes[:, None], one, other)
-        for one, other in ((true.contact, own.contact), (true.standoff, own.standoff))
-    )
-    loss = told.loss(true, goes, member.options.contact, member.options.phase)
+    loss = told.scores.new_zeros(())
+    if options.contact:
+        loss = loss + told.loss(contact, standoff).masked_fill(~goes, 0.0).mean()
+        with torch.no_grad():
+            own = told.likeliest()
+        contact, standoff = (torch.where(goes[:, None], *pair) for pair in zip((contact, standoff), own, strict=True))
+    if options.phase:
+        logits = network.guide.phase_logits(told, contact, standoff, felt.flatten(1), hand_in(felt))
+        loss = loss + nn.functional.cross_entropy(logits, true.phase)
     return Intention(contact, standoff, true.phase), loss
 
 
 def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, seed: int) -> Objective:
     """The loss of every member's head on inputs that are rotated and mirrored at random.
 
+    One of several processes is given its share of the rows, and draws as if it had all of them.
+
     A member that predicts its distance from the expert is also fitted to that: the norm of the difference between the
     normalised twists of the first step.
     """
     losses = [member.network.loss(algo.loss, algo.kl_weight) for member in members(learner)]
-    largest = math.radians(algo.turn)
+    largest, (rank, processes) = math.radians(algo.turn), rank_and_count()
 
     def objective(rows: TensorDictBase, step: int) -> Tensor:
         values = []
         for k, (member, loss) in enumerate(zip(members(learner), losses, strict=True)):
             own = numbered_seed(seed, "member", k)
-            draws = torch.rand(2, len(rows), generator=generator(own, TURN, step)).to(rows.device)
+            whole = processes * len(rows)
+            draws = torch.rand(2, whole, generator=generator(own, TURN, step))[:, rank::processes].to(rows.device)
             mirrored = (draws[1] < 0.5) & algo.mirror
             inputs, twist = rotated(member.network_inputs(rows), rows["twist"], (2 * draws[0] - 1) * largest, mirrored)
             intention = None
@@ -201,11 +209,11 @@ def imitation_objective(learner: Learner | Ensemble, algo: ImitationOptions, see
             encoded, _ = member.network(*(inputs[key] for key in INPUTS), intention)
             twist = twist.masked_fill(rows["is_pad"][..., None], 0.0)
             batch = {"encoded": encoded, "twist": twist, "is_pad": rows["is_pad"]}
-            with global_draws(generator(own, NOISE, step), twist.device):
+            with global_draws(generator(numbered_seed(own, "process", rank), NOISE, step), twist.device):
                 values.append(loss(TensorDict(batch, batch_size=rows.batch_size)))
             if member.options.discrepancy:
-                noise = torch.randn(len(rows), member.network.noise, generator=generator(own, NOISE, step))
-                plan, distance = member.planned(inputs, noise.to(twist.device))
+                noise = torch.randn(whole, member.network.noise, generator=generator(own, NOISE, step))
+                plan, distance = member.planned(inputs, noise[rank::processes].to(twist.device))
                 assert distance is not None
                 true = (plan[:, 0] - twist[:, 0]).norm(dim=-1, keepdim=True).detach()
                 values.append(nn.functional.smooth_l1_loss(distance, true, beta=0.1))

@@ -136,18 +136,28 @@ class AttentionPointNet(nn.Module):
         """See the class."""
         return self.attend(points, features, valid, context)[0]
 
-    def attend(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> tuple[Tensor, Tensor]:
-        """The result, and the points' scores [B, heads, N], -1e9 for those that are not valid."""
+    def attend(
+        self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor, among: Tensor | None = None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The result, the points' scores [B, heads, N] and features [B, N, width].
+
+        Args:
+            points: as of :class:`PointNet`.
+            features: likewise.
+            valid: likewise.
+            context: likewise.
+            among: [B, N] bool, the points that may be attended to, all others score -1e9; None: those that are valid.
+        """
         own = torch.cat([seen_from_tip(points, self.SCALES), features], dim=-1)
         local = self.second(self._first(own).relu()).relu()
         # A product and max cost half of masked_fill and amax, whose gradients copy and compare the whole cloud.
         pooled = (local * valid[..., None].to(local.dtype)).max(1).values
         scene = self.scene(torch.cat([pooled, context], dim=-1))
         again = torch.relu(self.again(local) + self.told(scene)[:, None])
-        scores = (self.score.weight @ again.mT).masked_fill(~valid[:, None], -1e9)
+        scores = (self.score.weight @ again.mT).masked_fill(~(valid if among is None else among)[:, None], -1e9)
         weight = scores.softmax(-1)  # [B, heads, N]
         attended = torch.cat([weight @ own, weight @ again], dim=-1)  # [B, heads, own + width]
-        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1)), scores
+        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1)), scores, again
 
     def _first(self, own: Tensor) -> Tensor:
         """The first layer, with zeros up to a multiple of four inputs: else its gradient takes three times as long."""

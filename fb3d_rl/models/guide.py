@@ -13,13 +13,18 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fb3d_rl.models.encoders import AttentionPointNet, seen_from_tip
+from fb3d_rl.geometry.transforms import alignment
+from fb3d_rl.models.encoders import AttentionPointNet, mlp, seen_from_tip
 
 SPREAD = 0.03
 """Distance (m) from the expert's contact point at which a point's score should be that of a standard deviation."""
 
 NEIGHBOURHOOD = 0.06
 """The contact point is a mean of the points within this distance (m) of the point with the highest score."""
+
+
+KEPT = 3.0
+"""By how much the logarithm of another point's probability has to be larger than that of the point chosen before."""
 
 
 class Intention(NamedTuple):
@@ -36,54 +41,59 @@ class Intention(NamedTuple):
     phase: Tensor
 
 
+class Hand(NamedTuple):
+    """The hand in B situations.
+
+    Attributes:
+        axis: [B, 3] unit direction from the tip to the hand.
+        held: [B, 1] whether the part is held, 0 or 1.
+    """
+
+    axis: Tensor
+    held: Tensor
+
+
 class Told(NamedTuple):
-    """What :class:`Guide` tells about B situations.
+    """What :class:`Guide` tells about contact points in B situations.
 
     Attributes:
         points: [B, N, 3] the points relative to the tip.
-        scores: [B, N] their scores, -1e9 of those that are not valid.
-        standoff: [B, 3] direction from the contact point to the hand, of any length.
-        phase: [B, P] logits of the phases.
+        scores: [B, N] their scores, -1e9 of those that cannot be touched.
+        standoff: [B, N, 3] directions from each of them to the hand, of any length.
+        scene: [B, W] what the guide has seen.
     """
 
     points: Tensor
     scores: Tensor
     standoff: Tensor
-    phase: Tensor
+    scene: Tensor
 
-    @torch.no_grad()
-    def intention(self) -> Intention:
-        """The intention that is the likeliest."""
-        points = self.points
-        best = points.gather(1, self.scores.argmax(1)[:, None, None].expand(-1, 1, 3))
-        away = (points - best).norm(dim=-1) > NEIGHBOURHOOD
-        weight = self.scores.masked_fill(away, -1e9).softmax(1)
-        phase = functional.one_hot(self.phase.argmax(1), self.phase.shape[1]).to(points.dtype)
-        return Intention((weight[:, None] @ points)[:, 0], functional.normalize(self.standoff, dim=1), phase)
+    def likeliest(self) -> tuple[Tensor, Tensor]:
+        """The likeliest contact point [B, 3] and the unit standoff there [B, 3]."""
+        best = self.points.gather(1, self.scores.argmax(1)[:, None, None].expand(-1, 1, 3))
+        away = (self.points - best).norm(dim=-1) > NEIGHBOURHOOD
+        weight = self.scores.masked_fill(away, -1e9).softmax(1)[:, None]
+        return (weight @ self.points)[:, 0], functional.normalize((weight @ self.standoff)[:, 0], dim=1)
 
-    def loss(self, true: Intention, goes: Tensor, contact: bool, phase: bool) -> Tensor:
-        """Mean of the cross-entropy of the points, 1 - cosine of the standoffs, and the cross-entropy of the phases.
+    def doubts(self, contact: Tensor) -> Tensor:
+        """Whether a point is more than e^KEPT times as likely as the one nearest to ``contact`` [B, 3]: [B, 1]."""
+        far = (self.points - contact[:, None]).norm(dim=-1).masked_fill(self.scores < -1e8, torch.inf)
+        there = self.scores.gather(1, far.argmin(1, keepdim=True))
+        return self.scores.amax(1, keepdim=True) - there > KEPT
 
-        Args:
-            true: the expert's intention.
-            goes: [B] bool, where it goes to a contact point; contact and standoff count there only.
-            contact: whether contact point and standoff count.
-            phase: whether phases do.
-        """
-        value = self.scores.new_zeros(())
-        if contact:
-            off = (self.points - true.contact[:, None]).square().sum(-1) / (2 * SPREAD**2)
-            wanted = (-off).masked_fill(self.scores < -1e8, -1e9).softmax(1)
-            each = -(wanted * self.scores.log_softmax(1)).sum(1)
-            each = each + 1 - functional.cosine_similarity(self.standoff, true.standoff)
-            value = value + each.masked_fill(~goes, 0.0).mean()
-        if phase:
-            value = value + functional.cross_entropy(self.phase, true.phase)
-        return value
+    def loss(self, contact: Tensor, standoff: Tensor) -> Tensor:
+        """Cross-entropy of the points and 1 - cosine of the standoffs [B], for the expert's own [B, 3] each."""
+        off = (self.points - contact[:, None]).square().sum(-1) / (2 * SPREAD**2)
+        wanted = (-off).masked_fill(self.scores < -1e8, -1e9).softmax(1)
+        side = 1 - functional.cosine_similarity(self.standoff, standoff[:, None], dim=-1)
+        return (wanted * (side - self.scores.log_softmax(1))).sum(1)
 
 
 class Guide(nn.Module):
     """Tells the expert's intention.
+
+    First the contact point, with the standoff at each point; then, for one contact point, the phase: whether the hand
+    is to approach depends on how it stands to the point that was chosen.
 
     Args:
         inputs: as of :class:`~fb3d_rl.models.encoders.PointNet`.
@@ -94,31 +104,51 @@ class Guide(nn.Module):
         phase: whether they say the phase.
     """
 
-    SCALES = (0.02, 0.05, 0.15)
+    SCALES, OFF_LINE, TURNS = (0.02, 0.05, 0.15), (0.02, 0.06), (0.05, 0.15)
+    """What the words distinguish: distances to the contact point, distances to the approach line (m), angles (rad)."""
 
     def __init__(self, inputs: int, context: int, phases: int, width: int, contact: bool, phase: bool) -> None:
         super().__init__()
         self.contact, self.phase = contact, phase
-        self.network = AttentionPointNet(inputs, context, 3 + phases, width, heads=1)
-        self.size = contact * (6 + len(self.SCALES) + 3 + 4) + phase * phases
+        place = contact * (16 + len(self.SCALES) + len(self.OFF_LINE) + len(self.TURNS))
+        self.network = AttentionPointNet(inputs, context, width, width, heads=1)
+        if contact:
+            self.side = nn.Linear(width, 3)
+        if phase:
+            self.phases = mlp(width + context + place, 2 * width, phases)
+        self.size = place + phase * phases
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Told:
-        """See :class:`~fb3d_rl.models.encoders.PointNet` for the shapes."""
-        output, scores = self.network.attend(points, features, valid, context)
-        return Told(points, scores[:, 0], output[:, :3], output[:, 3:])
+        """See :class:`~fb3d_rl.models.encoders.PointNet` for the shapes; the first of the features is the part mask.
 
-    def words(self, intention: Intention, held: Tensor) -> Tensor:
-        """An intention as a network can read it [B, size]; no contact point where the part is ``held`` [B, 1] (0 or 1).
-
-        Beside the point and the standoff these are where the tip is in the frame of the approach line: how far in
-        front of the point, and how far off the line.
+        Only points of the part can be the contact point, unless none is among those that are read.
         """
-        said = []
-        if self.contact:
-            point, axis = intention.contact, intention.standoff
-            ahead = -(point * axis).sum(-1, keepdim=True)
-            aside = -point - ahead * axis
-            said.append(torch.cat([seen_from_tip(point, self.SCALES), axis, ahead, aside], dim=-1) * (1 - held))
-        if self.phase:
-            said.append(intention.phase)
-        return torch.cat(said, dim=-1)
+        part = valid & (features[..., 0] > 0)
+        touchable = torch.where(part.any(1, keepdim=True), part, valid)
+        scene, scores, each = self.network.attend(points, features, valid, context, touchable)
+        return Told(points, scores[:, 0], self.side(each) if self.contact else torch.zeros_like(points), scene.relu())
+
+    def phase_logits(self, told: Told, contact: Tensor, standoff: Tensor, context: Tensor, hand: Hand) -> Tensor:
+        """Logits of the phases [B, P] of a hand that goes to ``contact`` from the side ``standoff``."""
+        place = [self._place(contact, standoff, hand)] if self.contact else []
+        logits: Tensor = self.phases(torch.cat([told.scene, context, *place], dim=1))
+        return logits
+
+    def words(self, intention: Intention, hand: Hand) -> Tensor:
+        """An intention as a network can read it [B, size]; no contact point where the part is held."""
+        place = [self._place(intention.contact, intention.standoff, hand)] if self.contact else []
+        return torch.cat([*place, *([intention.phase] if self.phase else ())], dim=-1)
+
+    def _place(self, point: Tensor, standoff: Tensor, hand: Hand) -> Tensor:
+        """A contact point and a standoff as a network can read them.
+
+        Beside these it says how the hand stands to the approach line: how far in front of the point the tip is, how far
+        off the line, and the turn from the hand to the line, with how near the last two are to 0: the expert approaches
+        when they are small, which a network could hardly tell from their components.
+        """
+        ahead = -(point * standoff).sum(-1, keepdim=True)
+        aside, turn = -point - ahead * standoff, alignment(hand.axis, standoff)
+        near = [torch.exp(-aside.norm(dim=-1, keepdim=True) / scale) for scale in self.OFF_LINE]
+        near += [torch.exp(-turn.norm(dim=-1, keepdim=True) / scale) for scale in self.TURNS]
+        said = torch.cat([seen_from_tip(point, self.SCALES), standoff, ahead, aside, turn, *near], dim=-1)
+        return said * (1 - hand.held)

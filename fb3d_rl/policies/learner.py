@@ -13,7 +13,7 @@ from fb3d_rl.geometry.transforms import normalize
 from fb3d_rl.models.artflownet import ArtFlowNet, artflownet_module
 from fb3d_rl.models.dense import initialize
 from fb3d_rl.models.encoders import ENCODERS, ArtFlowNetEncoder
-from fb3d_rl.models.guide import Guide, Intention, Told
+from fb3d_rl.models.guide import Guide, Hand, Intention, Told
 from fb3d_rl.policies.flow_state import APPROACH, PHASES, TRAVEL
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, hand_velocities, joint_velocities
 from fb3d_rl.policies.options import LearnerOptions
@@ -29,6 +29,9 @@ all in the world; held, force, height of the tip. They lie under the key "felt".
 
 HELD = 12
 """Which of them says whether the part is held."""
+
+GOAL = ("contact_point", "standoff")
+"""What a learner that tells the contact point keeps to while it is on its way."""
 
 INPUTS = ("points", "features", "valid", "felt")
 """Entries of the network's input."""
@@ -60,6 +63,11 @@ FLOW_KEYS: dict[str, Key | None] = {
 """Where the "+F" variants (supplement, III) read the flow: the release feeds them the ground truth."""
 
 
+def hand_in(felt: Tensor) -> Hand:
+    """The hand of the network's inputs "felt" [B, 1 + history, HAND_FEATURES]."""
+    return Hand(felt[:, 0, :3], felt[:, 0, HELD, None])
+
+
 class TwistNetwork(PlanNetwork):
     """An encoder and its heads.
 
@@ -89,17 +97,42 @@ class TwistNetwork(PlanNetwork):
         """
         points, context = points.masked_fill(~valid[..., None], 0.0), felt.flatten(1)
         if self.options.guided:
-            meant = intention or self.guide(points, features, valid, context).intention()
-            context = torch.cat([context, self.guide.words(meant, felt[:, 0, HELD, None])], dim=1)
+            meant = intention or self.intention(self.told(points, features, valid, felt), felt)
+            context = torch.cat([context, self.guide.words(meant, hand_in(felt))], dim=1)
         raw = self.encoder(points, features, valid, context)
         distance = nn.functional.softplus(raw[:, -1:]) if self.options.discrepancy else None
         return raw[:, : self._head.inputs], distance
 
-    def told(self, inputs: TensorDictBase) -> Told:
-        """What the guide tells about :meth:`Learner.network_inputs`."""
-        points, features, valid, felt = (inputs[key] for key in INPUTS)
+    def told(self, points: Tensor, features: Tensor, valid: Tensor, felt: Tensor) -> Told:
+        """What the guide tells about contact points."""
         told: Told = self.guide(points.masked_fill(~valid[..., None], 0.0), features, valid, felt.flatten(1))
         return told
+
+    @torch.no_grad()
+    def intention(
+        self, told: Told, felt: Tensor, before: tuple[Tensor, Tensor] | None = None, going: Tensor | None = None
+    ) -> Intention:
+        """The intention that is the likeliest.
+
+        Args:
+            told: of :meth:`told`.
+            felt: of the same inputs.
+            before: [B, 3] contact point and standoff of the last step, relative to the tip now. Several places are
+                often about as good, and a hand that goes for now one, now another gets to none: they are kept while
+                they are not doubted (:meth:`~fb3d_rl.models.guide.Told.doubts`).
+            going: [B, 1] bool, whether the hand was on its way to that point; needed with ``before``.
+        """
+        contact, standoff = told.likeliest()
+        if before is not None and going is not None:
+            keeps = going & ~told.doubts(before[0])
+            contact, standoff = (
+                torch.where(keeps, old, new) for old, new in zip(before, (contact, standoff), strict=True)
+            )
+        phase = contact.new_zeros(len(contact), len(PHASES))
+        if self.options.phase:
+            logits = self.guide.phase_logits(told, contact, standoff, felt.flatten(1), hand_in(felt))
+            phase = nn.functional.one_hot(logits.argmax(1), len(PHASES)).to(contact.dtype)
+        return Intention(contact, standoff, phase)
 
 
 class Learner(Policy):
@@ -154,11 +187,17 @@ class Learner(Policy):
         state: dict[str, tuple[tuple[int, ...], torch.dtype]] = {}
         if self.options.history:
             state["felt"] = ((self.options.history, HAND_FEATURES), torch.float32)
+        if self.options.contact:
+            state.update({key: ((3,), torch.float32) for key in GOAL}, going=((1,), torch.bool))
         state.update(plan_state(self.options, TWIST))
         return state
 
     def initial_state(self, batch: torch.Size) -> TensorDict:
-        """History and plan {"learner": ...}, all zeros at the start of an episode."""
+        """History, contact point and plan {"learner": ...}, all zeros at the start of an episode.
+
+        "contact_point" [E, 3] (world, m) is where it goes and "standoff" [E, 3] from which side, "going" [E, 1] whether
+        it does so.
+        """
         state = {key: torch.zeros(*batch, *shape, dtype=dtype) for key, (shape, dtype) in self._state().items()}
         return TensorDict({"learner": state} if state else {}, batch_size=batch)
 
@@ -205,18 +244,43 @@ class Learner(Policy):
             self.flow_network.eval()
         return self
 
-    def planned(self, inputs: TensorDictBase, noise: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
-        """Plan [B, chunk, 6] and discrepancy [B, 1] of :meth:`network_inputs`, from ``noise`` if the head needs it."""
-        encoded, distance = self.network(*(inputs[key] for key in INPUTS))
+    def planned(
+        self, inputs: TensorDictBase, noise: Tensor | None = None, intention: Intention | None = None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Plan [B, chunk, 6] and discrepancy [B, 1] of :meth:`network_inputs`, from ``noise`` if the head needs it.
+
+        With a guide the plan is for ``intention``, or for what the guide tells without that of the step before.
+        """
+        encoded, distance = self.network(*(inputs[key] for key in INPUTS), intention)
         return self.network.plan(encoded, noise), distance
+
+    def _intention(self, tensordict: TensorDictBase, inputs: TensorDictBase) -> Intention:
+        """What the guide tells; it keeps to its contact point while the hand is on its way. Writes the next state."""
+        network, obs = self.network, tensordict["observation"]
+        told = network.told(*(inputs[key] for key in INPUTS))
+        if not self.options.contact:
+            return network.intention(told, inputs["felt"])
+        tip, before, going = obs["tool_pose"][..., :3], None, None
+        if ("learner", "going") in tensordict.keys(True):  # not in labels that are read again
+            before = (tensordict["learner", "contact_point"] - tip, tensordict["learner", "standoff"])
+            going = tensordict["learner", "going"]
+        intention = network.intention(told, inputs["felt"], before, going)
+        on_its_way = ~obs["attached"]
+        if self.options.phase:
+            on_its_way = on_its_way & (intention.phase[:, [TRAVEL, APPROACH]].sum(1, keepdim=True) > 0)
+        state = {"contact_point": intention.contact + tip, "standoff": intention.standoff, "going": on_its_way}
+        for key, value in state.items():
+            tensordict["next", "learner", key] = value
+        return intention
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action, the history and the plan."""
+        """Write the action, the history, the contact point and the plan."""
         if self._predict is not None:
             self._predict(tensordict)
         inputs, obs = self.network_inputs(tensordict), tensordict["observation"]
-        plan, distance = self.planned(inputs, trial_noise(tensordict, self.network.noise))
+        intention = self._intention(tensordict, inputs) if self.options.guided else None
+        plan, distance = self.planned(inputs, trial_noise(tensordict, self.network.noise), intention)
         twist, state = executed(plan, tensordict.get("learner", None), self.options)
         for key, value in state.items():
             tensordict["next", "learner", key] = value

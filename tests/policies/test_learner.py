@@ -333,7 +333,7 @@ def test_half_of_the_points_are_the_nearest_or_on_the_part() -> None:
 def test_a_guided_learner_plans_for_what_its_guide_tells() -> None:
     policy, td = learner(contact=True, phase=True), scene(3)
     inputs = policy.network_inputs(td)
-    told = policy.network.told(inputs).intention()
+    told = policy.network.intention(policy.network.told(*(inputs[key] for key in INPUTS)), inputs["felt"])
     given = [policy.network(*(inputs[key] for key in INPUTS), meant)[0] for meant in (None, told)]
     assert torch.equal(*given)
     for change in ({"contact": told.contact + 0.1}, {"standoff": -told.standoff}, {"phase": told.phase.roll(1, 1)}):
@@ -345,6 +345,28 @@ def test_a_guided_learner_plans_for_what_its_guide_tells() -> None:
     again = Learner(policy.options, LIMITS, generator(5)).eval()
     again.network.load_state_dict(policy.network.state_dict())
     assert torch.equal(act(again, td)["action"], act(policy, td)["action"])
+
+
+def test_a_guided_learner_keeps_to_its_contact_point_until_it_holds_the_part_or_another_is_much_likelier() -> None:
+    policy, td = learner(contact=True), scene(3)
+    td["observation", "attached"][:] = False
+    first = act(policy, td)["next", "learner"].select("contact_point", "standoff", "going")
+    assert bool(first["going"].all())
+    with torch.no_grad():
+        policy.network.guide.network.score.weight.mul_(-0.01)  # now the least likely points, but hardly
+    td["observation", "tool_pose"][:, :3] += 0.05
+    fresh = act(policy, td)["next", "learner"]
+    assert not torch.equal(fresh["contact_point"], first["contact_point"])
+    td["learner"] = act(policy, td)["next", "learner"].update(first)
+    kept = policy(td.clone())["next", "learner"]
+    assert torch.allclose(kept["contact_point"], first["contact_point"], atol=1e-6), "in the world, not from the tip"
+    assert torch.equal(kept["standoff"], first["standoff"])
+    with torch.no_grad():
+        policy.network.guide.network.score.weight.mul_(1e7)
+    doubted = policy(td.clone())["next", "learner"]
+    assert not torch.equal(doubted["contact_point"], first["contact_point"])
+    td["observation", "attached"][0] = True
+    assert policy(td.clone())["next", "learner", "going"].flatten().tolist() == [False, True, True]
 
 
 def test_the_expert_s_intention_is_seen_from_the_tip() -> None:
