@@ -76,6 +76,7 @@ IMITATION = Entry(
     algorithm="fb3d_rl.algos.dagger:ALGORITHM",
     options="fb3d_rl.algos.options:ImitationOptions",
     opens_only=True,
+    joint_fit=True,
 )
 FITTED = "fb3d_rl.algos.options:FlowNetworkOptions"
 

@@ -1,6 +1,6 @@
 """Train: ``python launch/train.py [algo=NAME] [assets=partnet_mobility assets.root=DIR] ...``, NAME as in conf/algo.
 
-ArtFlowNet by several processes or GPUs: ``torchrun --nproc-per-node=N launch/train.py algo=artflownet ...``.
+ArtFlowNet, BC and DAgger by several processes or GPUs: ``torchrun --nproc-per-node=N launch/train.py algo=NAME ...``.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ def task(cfg: Any, out: Path) -> None:
     from fb3d_rl.registry import REGISTRY
     from fb3d_rl.training.processes import joined, rank_and_count, started
 
-    if not REGISTRY[cfg.algo.name].joint_fit and started() > 1:
-        raise UserError(f"algo={cfg.algo.name} is trained by one process: start it without torchrun")
+    if started() > 1 and (cfg.env.task is not None or not REGISTRY[cfg.algo.name].joint_fit):
+        what = f"algo={cfg.algo.name}" if cfg.env.task is None else f"env.task={cfg.env.task}"
+        raise UserError(f"{what} is trained by one process: start it without torchrun")
     with joined(out, fresh=not cfg.resume) as shared:
         run_training(cfg, shared)
         if rank_and_count()[0] == 0 and cfg.env.task is None:

@@ -147,11 +147,11 @@ def test_what_the_command_line_says_goes_before_an_experiment() -> None:
 
 @pytest.mark.parametrize("algo", sorted(path.stem for path in (CONF / "algo").glob("*.yaml")))
 def test_smoke_bounds_the_steps_of_every_algorithm(algo: str) -> None:
-    from fb3d_rl.algos import dagger, flow_network
+    from fb3d_rl.algos import flow_network, rounds
 
     cfg = compose("train", "experiment=smoke", f"algo={algo}")
     if hasattr(cfg.algo, "rounds"):
-        fits = [dagger.fit_options(cfg.algo, cfg.data.labels, 0, number) for number in range(cfg.algo.rounds)]
+        fits = [rounds.fit_options(cfg.algo, cfg.data.labels, 0, number) for number in range(cfg.algo.rounds)]
         assert sum(fit.steps for fit in fits) <= 75
     else:
         fit = flow_network.fit_options(cfg)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from fb3d_rl.algos.dagger import fit_options
 from fb3d_rl.algos.learners import new_learner
+from fb3d_rl.algos.rounds import fit_options
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.learner import LearnerOptions
 from fb3d_rl.seeds import derived

@@ -5,11 +5,10 @@ Behaviour cloning is the case of one round in which the expert always acts.
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -32,26 +31,31 @@ from fb3d_rl.algos.collection import (
     relabelled,
 )
 from fb3d_rl.algos.learners import (
-    Labels,
     acting_policy,
-    drawn_rows,
     flow_network,
-    imitation_objective,
     learner_options,
-    members,
     networks,
     new_gate,
     new_learner,
-    numbered_seed,
     policy_name,
 )
-from fb3d_rl.algos.weights import CHECKPOINT, load_network, state_before, weights_file
+from fb3d_rl.algos.rounds import (
+    BUFFER,
+    assist,
+    first_learner,
+    fit_options,
+    fit_round,
+    round_beta,
+    round_steps,
+    share,
+)
+from fb3d_rl.algos.weights import CHECKPOINT, state_before, weights_file
 from fb3d_rl.contract import Key
 from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.evaluate import evaluate, progress_bars
 from fb3d_rl.models.artflownet import ArtFlowNet
-from fb3d_rl.options import content, taken
+from fb3d_rl.options import content
 from fb3d_rl.policies.flow_policy import expert_policy
 from fb3d_rl.policies.hand import VelocityLimits
 from fb3d_rl.policies.interaction import BetaGate, Gate, InteractivePolicy
@@ -63,20 +67,15 @@ from fb3d_rl.rollout.demonstrations import Assets, recipe
 from fb3d_rl.rollout.rows import TrialRow
 from fb3d_rl.rollout.run import create_env, run_trials, state_of
 from fb3d_rl.rollout.trials import schedule
-from fb3d_rl.rollout.worker import steady_floats
 from fb3d_rl.scene.posed import Posed
 from fb3d_rl.training.checkpoint import fitting, load_checkpoint, save_checkpoint
-from fb3d_rl.training.fit import fit
-from fb3d_rl.training.options import FitOptions
+from fb3d_rl.training.processes import equal_share, rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
-from fb3d_rl.training.schedules import beta
 from fb3d_rl.training.state import check_state
 
 if TYPE_CHECKING:
     from fb3d_rl.algos.options import ImitationOptions
     from fb3d_rl.config import TrainConfig
-
-BUFFER = "buffer"
 
 
 @dataclass
@@ -132,8 +131,8 @@ class Run:
         self.logger = open_logger(cfg.logger.name, cfg.logger.project, out)
 
         self.expert = expert_policy(self.limits, setup.flow_policy_options(cfg))
-        flow_net = load_network(algo.flow_checkpoint) if algo.flow_checkpoint else None
-        self.learner = new_learner(learner_options(algo), self.limits, algo.members, cfg.seed, flow_net)
+        equal_share(algo.batch_size)
+        self.learner = first_learner(cfg)
         self.policy = InteractivePolicy(self.expert, self.learner, new_gate(algo))
         self.rows = rows_options(algo, self.limits, self.policy.gate)
         entries = setup.train_entries(cfg.assets, out, cfg.seed)
@@ -268,25 +267,15 @@ class Run:
     def fit(self, number: int, log: RunLog) -> None:
         """Fit the learner to all rows; checkpoints are saved meanwhile."""
         done, before = self.done, self.steps_before(number)
-        options = fit_options(self.algo, self.cfg.data.labels, self.cfg.seed, number)
 
         def checkpoint(state: dict[str, Any]) -> None:
             done.fit, done.log_rows = state, log.rows
             self.save()
 
-        if number == 0:  # later on it would change what the weights mean
-            twists = [self.buffer.frames(i)["expert", "twist"] for i in range(len(self.buffer.episodes))]
-            for member in members(self.learner):
-                member.network.normalize(torch.cat(twists))
-        nets = networks(self.learner).to(self.protocol.device)
-        objective = imitation_objective(self.learner, self.algo, options.seed)
-        labels = Labels(self.buffer, self.algo.learner.chunk, drawn_rows(self.buffer, self.algo.sampling, number))
-        # One thread: several would wait for each other on cores that also collect, and slow both down many times.
-        with steady_floats() if self.algo.overlap else nullcontext():
-            fit(nets, labels, options, objective=objective, device=self.protocol.device, on_checkpoint=checkpoint,
-                resume=done.fit, log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
-                title=f"round {number + 1} of {self.algo.rounds}: fit")  # fmt: skip
-        nets.to("cpu")
+        wait_for_all()  # the others open the buffer now
+        fit_round(self.learner, self.buffer, self.cfg, number, on_checkpoint=checkpoint, resume=done.fit,
+                  log=lambda row: log.write({**row, "step": before + row["step"], "round": number}),
+                  title=f"round {number + 1} of {self.algo.rounds}: fit")  # fmt: skip
 
     def validate(self) -> dict[str, float]:
         """The learner's success and contact rate on a few validation objects."""
@@ -320,7 +309,10 @@ class Imitation:
     """algo=bc and algo=dagger, see :class:`~fb3d_rl.algos.algorithm.Algorithm`."""
 
     def train(self, cfg: TrainConfig, out: Path) -> list[TrialRow]:
-        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`."""
+        """See :class:`~fb3d_rl.algos.algorithm.Algorithm`; only the first process returns rows."""
+        if rank_and_count()[0]:
+            assist(cfg, out)
+            return []
         job = Run(cfg, out)
         job.train()
         policies: dict[str, Any] = {"expert": job.expert} if cfg.evaluation.expert else {}
@@ -365,13 +357,6 @@ class Imitation:
 ALGORITHM = Imitation()
 
 
-def round_beta(algo: ImitationOptions, number: int) -> float:
-    """The expert's share of a round's steps; 1 in the first round, since the learner is untrained."""
-    if number == 0:
-        return 1.0
-    return beta(algo.beta.schedule, number, algo.beta.value, algo.beta.rounds, algo.beta.base)
-
-
 def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> RowsOptions:
     """What a row of the buffer holds."""
     state = gate.initial_state(torch.Size([1])).keys(include_nested=True, leaves_only=True)
@@ -380,19 +365,3 @@ def rows_options(algo: ImitationOptions, limits: VelocityLimits, gate: Gate) -> 
     further = tuple(dict.fromkeys([*state, *compared, *draws]))
     return RowsOptions(limits, algo.learner.history, FLOW_KEYS[algo.learner.flow], further, algo.oracle,
                        algo.learner.guided)  # fmt: skip
-
-
-def fit_options(algo: ImitationOptions, labels: int, seed: int, number: int) -> FitOptions:
-    """How the learner is fitted in a round; each round has a warm-up and a decay of the learning rate."""
-    return taken(FitOptions, algo, steps=round_steps(algo, labels, number), seed=numbered_seed(seed, "round", number))
-
-
-def round_steps(algo: ImitationOptions, labels: int, number: int) -> int:
-    """A round's share of the optimizer steps: ``algo.epochs`` draws of each label in all, and at least one a round."""
-    total = max(algo.rounds, math.ceil(algo.epochs * labels / algo.batch_size))
-    return share(total, algo.rounds, number)
-
-
-def share(total: int, rounds: int, number: int) -> int:
-    """The part of a total that round ``number`` of ``rounds`` has; the first rounds share the remainder."""
-    return total // rounds + (number < total % rounds)

@@ -46,7 +46,7 @@ from fb3d_rl.training.device import emulates_bf16, require_compiler
 from fb3d_rl.training.fit import fit
 from fb3d_rl.training.objective import Objective
 from fb3d_rl.training.options import FitOptions
-from fb3d_rl.training.processes import rank_and_count, wait_for_all
+from fb3d_rl.training.processes import equal_share, rank_and_count, wait_for_all
 from fb3d_rl.training.run_log import RunLog, open_logger
 from fb3d_rl.training.state import check_state
 
@@ -278,11 +278,8 @@ def fit_options(cfg: TrainConfig) -> FitOptions:
     Raises:
         UserError: the batch size is no multiple of the number of processes that fit together.
     """
-    algo, processes = cast("FlowNetworkOptions", cfg.algo), rank_and_count()[1]
-    if algo.batch_size % processes:
-        raise UserError(
-            f"algo.batch_size={algo.batch_size} cannot be split equally among {processes} processes; give a multiple"
-        )
+    algo = cast("FlowNetworkOptions", cfg.algo)
+    equal_share(algo.batch_size)
     rows = len(load_samples(Path(cfg.data.dataset))) if cfg.data.dataset else cfg.data.train_samples
     rows += cfg.data.met_samples if cfg.data.met_by else 0
     epochs = min(algo.epochs, cfg.data.max_epochs or algo.epochs)

@@ -25,8 +25,9 @@ from torchrl.envs import EnvBase
 
 from fb3d_rl.algos import setup
 from fb3d_rl.algos.collection import expert_share, kept_buffer
-from fb3d_rl.algos.dagger import BUFFER, Progression, fit_options, round_beta, share
+from fb3d_rl.algos.dagger import Progression
 from fb3d_rl.algos.learners import NOISE, Labels, drawn_rows
+from fb3d_rl.algos.rounds import BUFFER, fit_options, round_beta, share
 from fb3d_rl.algos.weights import CHECKPOINT, state_before
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded

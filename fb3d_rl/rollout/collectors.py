@@ -31,7 +31,7 @@ from torchrl.envs.utils import ExplorationType
 from fb3d_rl.contract import Key
 from fb3d_rl.errors import UserError
 from fb3d_rl.rollout.options import CollectorOptions
-from fb3d_rl.rollout.worker import EpisodeCollector, Worker, WorkerDied, start_ray
+from fb3d_rl.rollout.worker import EpisodeCollector, NoRoom, Worker, WorkerDied, start_ray
 
 log = logging.getLogger(__name__)
 
@@ -216,7 +216,9 @@ class Workers:
         except Exception as error:
             if isinstance(error, UserError) and not worker.starts:
                 raise
-            if not self._stopping:  # which ends processes while they are being started
+            if isinstance(error, NoRoom):
+                log.warning("a worker less: %s", error)
+            elif not self._stopping:  # which ends processes while they are being started
                 log.exception("a worker could not be started")
             self._not_run = f"not run: a worker could not be started ({type(error).__name__}: {error})"
             return False
@@ -253,8 +255,12 @@ class Workers:
         path.write_bytes(content)
         return path
 
-    def _new_collector(self) -> BaseCollector:
-        """The one place that makes TorchRL's collectors: an :class:`EpisodeCollector`, here or elsewhere."""
+    def _new_collector(self, ray_options: dict[str, Any] | None = None) -> BaseCollector:
+        """The one place that makes TorchRL's collectors: an :class:`EpisodeCollector`, here or elsewhere.
+
+        Args:
+            ray_options: of its actor, if the backend is Ray.
+        """
         local = dict(use_buffers=False, auto_register_policy_transforms=False)
         if self._direct:
             return EpisodeCollector(partial(_idle_env, self._create_env_fn), self._policy, **local, **self._rollout)
@@ -269,7 +275,7 @@ class Workers:
         )
         create = [partial(_idle_env, partial(_unpacked_env, self._packed_env))]
         if self._options.backend == "ray":
-            return Collector(create, collector_kwargs=local, **remote)
+            return Collector(create, collector_kwargs=local, remote_configs=ray_options, **remote)
         return Collector(create, num_threads=self._threads, **local, **remote)
 
 

@@ -77,6 +77,14 @@ class EpisodeCollector(Collector):
         return frames if keys is None else frames.select(*keys, strict=False)
 
 
+ROOM_AFTER = 30
+"""Seconds for which a worker waits for room in a Ray cluster; a dead worker's is free after some of them."""
+
+
+class NoRoom(Exception):
+    """There is no room for another worker; the message says how much it needs."""
+
+
 class WorkerDied(Exception):
     """A worker does not run (any more); the message says why."""
 
@@ -85,24 +93,30 @@ class Worker:
     """A worker, which can be started again after it has died.
 
     Args:
-        new: makes an :class:`EpisodeCollector`, or the TorchRL collector that has one in another process.
+        new: makes an :class:`EpisodeCollector`, or the TorchRL collector that has one in another process; on Ray it is
+            given the options of the actor, else nothing.
         backend: where that is: "direct", "process" or "ray".
 
     Attributes:
         starts: how often it was started since it was made or closed.
     """
 
-    def __init__(self, new: Callable[[], BaseCollector], backend: str) -> None:
+    def __init__(self, new: Callable[..., BaseCollector], backend: str) -> None:
         self.starts = 0
         self._new, self._backend = new, backend
         self._collector: BaseCollector | None = None
         self._process: BaseProcess | None = None  # of the backend "process" alone
+        self._place: Any = None  # Ray's placement group
 
     def start(self) -> None:
-        """Start it, unless it is running."""
+        """Start it, unless it is running.
+
+        Raises:
+            NoRoom: no node of the Ray cluster has a CPU for it.
+        """
         if self._collector is not None:
             return
-        collector = self._new()
+        collector = self._new() if self._backend != "ray" else self._new(self._ray_options())
         if self._backend == "process":
             [number] = collector.map_fn("process_id", [()])
             self._process = next(child for child in multiprocessing.active_children() if child.pid == number)
@@ -139,6 +153,7 @@ class Worker:
                 # Ray's: otherwise its finalizer would start Ray again after Workers.close, and end this process a
                 # minute after Ray is gone.
                 collector.shutdown()
+                self._leave_place()
             raise WorkerDied(cause) from error
 
     def close(self) -> None:
@@ -148,6 +163,37 @@ class Worker:
                 self._process.terminate()  # it has nothing to save, and an orderly end takes seconds
             self._collector.shutdown()
         self._collector, self._process, self.starts = None, None, 0
+        self._leave_place()
+
+    def _ray_options(self) -> dict[str, Any]:
+        """Options of a Ray actor that has a CPU and memory reserved for it on some node of the cluster.
+
+        An actor for which there is no room would wait for ever, for instance after its node has gone.
+        """
+        import ray
+        from ray.util.placement_group import placement_group
+        from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
+        from torchrl.collectors.distributed.ray import DEFAULT_REMOTE_CLASS_CONFIG
+
+        self._leave_place()
+        needs = {"CPU": 1, "memory": DEFAULT_REMOTE_CLASS_CONFIG["memory"]}
+        self._place = placement_group([needs])
+        if not self._place.wait(ROOM_AFTER):
+            self._leave_place()
+            total = ray.cluster_resources()
+            raise NoRoom(
+                f"no node of the Ray cluster had a free CPU and {needs['memory'] / 2**30:.0f} GiB within "
+                f"{ROOM_AFTER} s; the cluster has {total.get('CPU', 0):.0f} CPUs in all"
+            )
+        options = DEFAULT_REMOTE_CLASS_CONFIG | {"num_gpus": None}  # trials run on CPUs
+        return options | {"scheduling_strategy": PlacementGroupSchedulingStrategy(self._place)}
+
+    def _leave_place(self) -> None:
+        if self._place is not None:
+            from ray.util.placement_group import remove_placement_group
+
+            remove_placement_group(self._place)
+            self._place = None
 
     def _cause_of_death(self, error: Exception) -> str | None:
         """What the worker died of, after a call of it raised ``error``; None if it is alive."""

@@ -109,8 +109,8 @@ def _prepare(
         buffer = resident(buffer, device, torch.cuda.mem_get_info(device)[0] // 2)
     if options.compile:
         cast(nn.Module, model.network).compile(dynamic=True)
+    state = FitState(model, options, averages=processes > 1 and objective is not None)
     objective = objective or flow_objective(model if processes == 1 else DistributedDataParallel(model), options, share)
-    state = FitState(model, options)
     if resume is not None:
         state.load_state_dict(resume)
 

@@ -15,6 +15,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn as ema_of
 from fb3d_rl.errors import UserError
 from fb3d_rl.training.objective import Objective
 from fb3d_rl.training.options import FitOptions, learning_rate
+from fb3d_rl.training.processes import average_gradients
 
 
 class FitState:
@@ -23,6 +24,7 @@ class FitState:
     Args:
         model: trained in place.
         options: how.
+        averages: whether it averages the gradients of several processes; else the objective does so, if need be.
 
     Attributes:
         average: moving average of the weights; None without ``options.ema``.
@@ -30,8 +32,8 @@ class FitState:
         loss_sum, loss_count: sum and number of the losses since the last log row.
     """
 
-    def __init__(self, model: nn.Module, options: FitOptions) -> None:
-        self.model, self.options = model, options
+    def __init__(self, model: nn.Module, options: FitOptions, averages: bool = False) -> None:
+        self.model, self.options, self.averages = model, options, averages
         self.optimizer = torch.optim.Adam(model.parameters(), lr=options.lr, fused=True)
         self.average = (
             None if options.ema is None else AveragedModel(model, multi_avg_fn=ema_of(options.ema), use_buffers=True)
@@ -46,6 +48,8 @@ class FitState:
         value = objective(batch, self.step)
         if value.requires_grad:  # else the objective has left the gradients in place
             value.backward()
+        if self.averages:
+            average_gradients(self.model)
         if self.options.clip_norm is not None:
             nn.utils.clip_grad_norm_(self.model.parameters(), self.options.clip_norm)
         self.optimizer.step()

@@ -18,11 +18,12 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.algos import collection
-from fb3d_rl.algos.dagger import BUFFER, CHECKPOINT, share
 from fb3d_rl.algos.learners import Labels, drawn_rows
 from fb3d_rl.algos.options import SamplingOptions
+from fb3d_rl.algos.rounds import BUFFER, share
 from fb3d_rl.algos.run import run_evaluation
 from fb3d_rl.algos.run import run_training as run
+from fb3d_rl.algos.weights import CHECKPOINT
 from fb3d_rl.camera.views import View
 from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.errors import UserError

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict
 
 from fb3d_rl.algos import task
-from fb3d_rl.algos.dagger import BUFFER
+from fb3d_rl.algos.rounds import BUFFER
 from fb3d_rl.algos.run import run_training
 from fb3d_rl.algos.task import load_learner
 from fb3d_rl.algos.weights import CHECKPOINT

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from fb3d_rl.data.demonstrations import DemonstrationBuffer
 from fb3d_rl.training.run_log import read_rows
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -65,8 +66,30 @@ def test_two_processes_fit_as_one_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_two_processes_imitate_as_one_does(tmp_path: Path) -> None:
+    words = ["algo=dagger", "experiment=smoke", "algo.batch_size=32", "algo.log_every=1", "algo.checkpoint_every=4",
+             "data.labels=320", "algo.rounds=2", "evaluation.trials=1", "evaluation.expert=false",
+             "algo.learner.contact=true", "algo.learner.phase=true", "collector=direct"]  # fmt: skip
+    rows, episodes = [], []
+    for processes in (1, 2):
+        done = train(tmp_path / str(processes), processes, *words)
+        assert done.returncode == 0, done.stderr
+        [log] = sorted((tmp_path / str(processes)).rglob("metrics.jsonl"))
+        rows.append([row for row in read_rows(log) if "train/loss" in row])
+        episodes.append(DemonstrationBuffer.open(log.parent / "buffer").episodes)
+        assert (log.parent / "summary.json").exists()
+    first = [[row["train/loss"] for row in run if row["round"] == 0] for run in rows]
+    # The mean of two halves' gradients is the whole batch's: they part by rounding alone.
+    assert len(first[0]) == len(first[1]) >= 10
+    assert all(abs(two - one) < 0.01 * one for one, two in zip(*first, strict=True)), first
+    assert episodes[0][0] == episodes[1][0], "the first round is the expert's"
+    assert {row["round"] for row in rows[1]} == {0, 1}
+
+
+@pytest.mark.slow
 def test_what_one_process_trains_refuses_several(tmp_path: Path) -> None:
-    done = train(tmp_path, 2, "algo=bc", "experiment=smoke")
+    done = train(tmp_path, 2, "algo=screwnet", "experiment=smoke")
     assert done.returncode != 0 and "start it without torchrun" in done.stderr
-    done = train(tmp_path, 2, *SMALL, "algo.batch_size=3")
-    assert done.returncode != 0 and "cannot be split equally" in done.stderr
+    for words in ([*SMALL, "algo.batch_size=3"], ["algo=bc", "experiment=smoke", "algo.batch_size=3"]):
+        done = train(tmp_path, 2, *words)
+        assert done.returncode != 0 and "cannot be split equally" in done.stderr, words

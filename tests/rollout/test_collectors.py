@@ -12,6 +12,7 @@ import os
 import re
 import signal
 from functools import partial
+from pathlib import Path
 from types import ModuleType
 from typing import Literal
 
@@ -170,6 +171,38 @@ def test_ray(create: partial[TrialEnv], trials: list[Trial], expected: dict[floa
     assert "its Ray worker died" in check("ray", 2, create, trials, expected)
     gc.collect()  # the finalizer of a collector that still has actors starts Ray anew
     assert not ray.is_initialized()
+
+
+@pytest.mark.slow
+def test_ray_on_two_nodes_of_which_one_dies(
+    create: partial[TrialEnv],
+    trials: list[Trial],
+    expected: dict[float, list[Episode]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed; install it to run this test")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    second = cluster.add_node(num_cpus=1)
+    monkeypatch.setenv("RAY_ADDRESS", cluster.address)
+    policy = Policy("exception")
+    try:
+        with Workers(create, policy, CollectorOptions("ray", 2, 2), HORIZON) as workers:
+            policy.set_weight(0.25)
+            workers.update_policy_weights_()
+            for episode, same_trial in zip(run(workers, trials), expected[0.25], strict=True):
+                assert same(episode, same_trial)
+            nodes = {
+                Path(f"/proc/{worker.call('process_id')}/stat").read_text().split()[3] for worker in workers._workers
+            }
+            assert len(nodes) == 2, "each worker is the child of another node's process"
+            cluster.remove_node(second)
+            episodes = run(workers, trials * 3)
+            assert sum(bool(episode.error) for episode in episodes) <= 1, "the trial that ran there"
+            assert all(same(one, expected[0.25][one.index % 4]) for one in episodes if not one.error)
+    finally:
+        cluster.shutdown()
 
 
 def test_ray_is_asked_for_where_it_is_missing(create: partial[TrialEnv], monkeypatch: pytest.MonkeyPatch) -> None:
