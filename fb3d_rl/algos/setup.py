@@ -136,6 +136,17 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
     return entry_of(folder_entries(cfg.assets.paths[0]), word).load()
 
 
+def object_root(cfg: ViewConfig) -> str | None:
+    """Where :func:`one_object` finds its object; None if it is made anew, and gone with the folder that it is made in.
+
+    It is the path from which :class:`~fb3d_rl.rollout.demonstrations.Assets` can read it again.
+    """
+    word = None if cfg.object is None else Path(str(cfg.object)).expanduser()
+    if word is not None and word.exists():
+        return str(word.resolve())
+    return None if cfg.assets.source == "procedural" else str(Path(cfg.assets.paths[0]).expanduser().resolve())
+
+
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:
     """Read the objects; each with its split."""
     return [(entry.load(), entry.split) for entry in entries]

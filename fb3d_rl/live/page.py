@@ -31,7 +31,8 @@ from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
 from fb3d_rl.live.server import HOST, start_server
-from fb3d_rl.live.session import Moment, Session
+from fb3d_rl.live.moment import Moment
+from fb3d_rl.live.session import Session
 
 COLORS: dict[str, Color] = {"predicted": FLOW, "true": srgb("#2c9f5b")}
 """Of the arrows of each flow."""
