@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import asdict
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -41,7 +40,7 @@ def shared_rows(acting: TensorDictModuleBase, limits: VelocityLimits) -> RowsOpt
     """
     learner = acting.learner if isinstance(acting, InteractivePolicy) else acting
     assert learner is not None
-    options = members(learner)[0].options  # type: ignore[arg-type]  # a Learner or an Ensemble
+    options = members(learner)[0].options
     written = [key for key in learner.out_keys if key[0] == "learner"]
     further: tuple[Key, ...] = (("learner", "action"), *written)
     return RowsOptions(limits, options.history, FLOW_KEYS[options.flow], further, guided=options.guided)
@@ -164,7 +163,9 @@ class Recording:
                 f"the rows of {self._folder} hold {shape[0]} earlier steps of the hand, and this learner reads "
                 f"{self._rows.history}; {NOT_MADE}"
             )
-        before, now = (dict(leaves(json.loads(json.dumps(env)))) for env in (buffer.about.get("env") or {}, about["env"]))
+        before, now = (
+            dict(leaves(json.loads(json.dumps(env)))) for env in (buffer.about.get("env") or {}, about["env"])
+        )
         other = sorted(key for key in {*before, *now} - {"horizon"} if before.get(key) != now.get(key))
         if other:
             raise UserError(

@@ -22,6 +22,7 @@ from fb3d_rl.assets.catalog import (
     lost_geometry,
     procedural_catalog,
 )
+from fb3d_rl.assets.folders import MANISKILL
 from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import ViewRange
@@ -144,7 +145,10 @@ def object_root(cfg: ViewConfig) -> str | None:
     word = None if cfg.object is None else Path(str(cfg.object)).expanduser()
     if word is not None and word.exists():
         return str(word.resolve())
-    return None if cfg.assets.source == "procedural" else str(Path(cfg.assets.paths[0]).expanduser().resolve())
+    if cfg.assets.source == "procedural":
+        return None
+    given = cfg.assets.paths[0]
+    return given if given == MANISKILL else str(Path(given).expanduser().resolve())
 
 
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:

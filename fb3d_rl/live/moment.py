@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 FLOWS = {"true": ("privileged", "flow"), "predicted": ("prediction", "flow")}
 """The flows that a policy can act on; the expert acts on the true one."""
 
+
 @dataclass(frozen=True, eq=False)
 class Contact:
     """A contact [3] (m) with the unit vectors [3] of the pull and from the contact to the hand's standoff pose."""
@@ -70,3 +71,18 @@ class Moment:
     metrics: dict[str, float]
     contact: Contact | None
     trial: Progress | None
+
+
+def status(moment: Moment, playing: bool) -> str:
+    """The state of the trial, in a line or two."""
+    trial = moment.trial
+    if trial is None:
+        if moment.contact is None:
+            return "No contact point can be chosen from what the camera sees."
+        return "Click the blue part to choose another contact point."
+    if trial.done:
+        outcome = "**opened**" if trial.success else "**not opened** in time"
+    else:
+        outcome = ("" if playing else "paused in phase ") + f"**{trial.phase}**"
+    held = "holds the part" if trial.attached else "holds nothing"
+    return f"step {trial.steps}: {outcome}, {held}\n\nnormalized distance **{trial.distance:.2f}**"
