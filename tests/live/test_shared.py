@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
+import runpy
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from fb3d_rl.algos.dagger import BUFFER, Imitation, rows_options
+from fb3d_rl.algos.dagger import BUFFER, rows_options
 from fb3d_rl.algos.learners import new_learner
 from fb3d_rl.algos.options import ImitationOptions
 from fb3d_rl.algos.recording import Recording, shared_rows
@@ -26,7 +27,9 @@ from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.env.options import EnvOptions
 from fb3d_rl.errors import UserError
+from fb3d_rl.live.server import start_server
 from fb3d_rl.live.shared import SharedSession
+from fb3d_rl.live.shared_page import SharedPage
 from fb3d_rl.policies.flow_policy import FlowPolicyOptions, expert_policy
 from fb3d_rl.policies.hand import hand_axis
 from fb3d_rl.policies.interaction import BetaGate, InteractivePolicy, OracleGate
@@ -40,6 +43,7 @@ SAMPLES = SampleOptions(points=300, camera=CAMERA)
 ENV = EnvOptions(points=300, camera=CAMERA, horizon=120)
 LIMITS = limits_of(ENV)
 SMALL = LearnerOptions(points=64, width=16)
+ROOT = Path(__file__).parents[2]
 
 
 def learner(options: LearnerOptions = SMALL) -> Learner:
@@ -49,7 +53,8 @@ def learner(options: LearnerOptions = SMALL) -> Learner:
     return made
 
 
-Open = Callable[..., SharedSession]
+Open: TypeAlias = Callable[..., SharedSession]
+Record: TypeAlias = Callable[..., Recording]
 
 
 @pytest.fixture
@@ -265,11 +270,59 @@ def test_without_a_trial_nothing_is_dragged(opened: Open) -> None:
     assert not session.person.in_charge
 
 
+# ---------------------------------------------------------------------------------------------------------- the page
+
+
+@pytest.fixture
+def server() -> Iterator[Any]:
+    pytest.importorskip("viser", reason="viser is not installed; install it to run this test")
+    made = start_server(18300, "test")
+    yield made
+    made.stop()
+
+
+def test_the_page_hands_over_and_back(server: Any, opened: Open) -> None:
+    session = opened()
+    page = SharedPage(server, session)
+    assert not page._handle.visible and page._release.disabled and "Play or Step" in page._who.content
+
+    def ask(button: str) -> None:
+        page._request(object(), lambda: page._act(button))
+        page.attend(0.0)
+
+    for _ in range(2):
+        ask("Step")
+        assert page._handle.visible and "**learner** acts" in page._who.content
+        np.testing.assert_allclose(page._handle.position, session.moment.tip[:3], atol=1e-6)
+
+    goal = session.moment.tip[:3] + np.array([0.0, 0.3, 0.1])
+    page._handle.position = goal
+    page._dragged()
+    assert not session.person.in_charge, "nothing happens in the thread that drags"
+    page.attend(0.0)
+    for _ in range(12):
+        ask("Step")
+    assert "hand follows" in page._who.content and not page._release.disabled
+    assert session.trial is not None and session.trial.by == "person"
+    np.testing.assert_allclose(page._handle.position, goal, atol=1e-6)
+    assert np.linalg.norm(session.moment.tip[:3] - goal) < 0.02
+
+    page._request("release", session.release)
+    ask("Step")
+    assert session.trial.by == "learner" and page._release.disabled
+    np.testing.assert_allclose(page._handle.position, session.moment.tip[:3], atol=1e-6)
+    page._request("pick", lambda: session.pick(*another_point(session)[1:]))
+    ask("Step")
+    assert session.trial.by == "person" and "your point" in page._who.content
+    ask("Reset")
+    assert not page._handle.visible and page._release.disabled
+
+
 # --------------------------------------------------------------------------------------------------- what is recorded
 
 
 @pytest.fixture
-def record(procedural_objects: dict[str, ArticulatedObject], procedural_root: Path) -> Iterator[Callable[..., Recording]]:
+def record(procedural_objects: dict[str, ArticulatedObject], procedural_root: Path) -> Iterator[Record]:
     """Opens recordings of the microwave."""
     made: list[Recording] = []
 
@@ -284,7 +337,7 @@ def record(procedural_objects: dict[str, ArticulatedObject], procedural_root: Pa
             recording.close()
 
 
-def test_an_episode_is_kept_as_a_runs_buffer_keeps_it(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_an_episode_is_kept_as_a_runs_buffer_keeps_it(opened: Open, record: Record, tmp_path: Path) -> None:
     session = opened(record(tmp_path / "met"))
     session.step()
     session.drag(*goal_of(session, [0.0, 0.3, 0.1]))
@@ -309,7 +362,7 @@ def test_an_episode_is_kept_as_a_runs_buffer_keeps_it(opened: Open, record: Any,
     assert exact and film.expert_acts is not None and film.expert_acts.tolist() == [False, True, True, False, False]
 
 
-def test_a_folder_goes_on_and_what_is_unfinished_is_not_kept(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_a_folder_goes_on_and_what_is_unfinished_is_not_kept(opened: Open, record: Record, tmp_path: Path) -> None:
     folder = tmp_path / "met"
     for episodes, fits in ((1, 3), (3, 4)):
         recording = record(folder, fits=fits)
@@ -326,7 +379,7 @@ def test_a_folder_goes_on_and_what_is_unfinished_is_not_kept(opened: Open, recor
     assert not list(tmp_path.glob(".*"))
 
 
-def test_a_trial_of_full_length_is_one_episode(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_a_trial_of_full_length_is_one_episode(opened: Open, record: Record, tmp_path: Path) -> None:
     env = replace(ENV, horizon=6)
     session = opened(record(tmp_path / "met", env=env), env=env)
     session.step()
@@ -339,7 +392,7 @@ def test_a_trial_of_full_length_is_one_episode(opened: Open, record: Any, tmp_pa
     assert len(DemonstrationBuffer.open(tmp_path / "met").episodes) == 1
 
 
-def test_a_full_folder_begins_no_trial(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_a_full_folder_begins_no_trial(opened: Open, record: Record, tmp_path: Path) -> None:
     env = replace(ENV, horizon=4)
     recording = record(tmp_path / "met", env=env)
     session = opened(recording, env=env)
@@ -351,7 +404,7 @@ def test_a_full_folder_begins_no_trial(opened: Open, record: Any, tmp_path: Path
     assert session.trial is None
 
 
-def test_a_learner_that_tells_intentions_gets_none_of_a_drag(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_a_learner_that_tells_intentions_gets_none_of_a_drag(opened: Open, record: Record, tmp_path: Path) -> None:
     """Where the person drags the hand, no contact point is the label's."""
     options = replace(SMALL, contact=True, phase=True)
     session = opened(record(tmp_path / "met", options), learner(options))
@@ -366,7 +419,7 @@ def test_a_learner_that_tells_intentions_gets_none_of_a_drag(opened: Open, recor
     assert frames["expert", "phase"].flatten().tolist() == [travel, travel, select, select, travel]
 
 
-def test_what_is_no_folder_of_these_is_refused(record: Any, tmp_path: Path) -> None:
+def test_what_is_no_folder_of_these_is_refused(record: Record, tmp_path: Path) -> None:
     def sentence(folder: Path, **more: Any) -> str:
         before = sorted(folder.rglob("*")) if folder.is_dir() else folder.read_bytes()
         with pytest.raises(UserError) as caught:
@@ -388,7 +441,7 @@ def test_what_is_no_folder_of_these_is_refused(record: Any, tmp_path: Path) -> N
     assert "lack observation.points" in sentence(tmp_path / "demos")
 
 
-def test_episodes_of_another_task_or_learner_do_not_mix(opened: Open, record: Any, tmp_path: Path) -> None:
+def test_episodes_of_another_task_or_learner_do_not_mix(opened: Open, record: Record, tmp_path: Path) -> None:
     folder = tmp_path / "met"
     recording = record(folder)
     with pytest.raises(UserError, match="another process"):
@@ -424,3 +477,61 @@ def test_a_made_object_is_kept_beside_the_folder(
         session.reset()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["met", "met_objects"]
     assert recorded_object(DemonstrationBuffer.open(tmp_path / "met"), 0).id == obj.id
+
+
+SMALL_RUN = [
+    "experiment=smoke", "algo=dagger", "algo.rounds=2", "algo.beta.schedule=first", "data.labels=90", "algo.epochs=0.7",
+    "algo.batch_size=8", "algo.learner.encoder=pointnet", "algo.learner.width=8", "algo.learner.points=64",
+    "assets.categories=[Microwave]", "data.points=256", "camera.resolution=48", "evaluation.trials=0",
+    "collector=direct", "env.horizon=40",
+]  # fmt: skip
+VIEW = [
+    "policy=dagger", "object=Microwave", "data.points=256", "camera.resolution=48", "env.horizon=40",
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_from_a_run_to_the_page_and_back(
+    config: Any, launch: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run's learner acts, a person takes over twice, and a further run and launch/demos.py read what was kept."""
+    run, folder, again = tmp_path / "run", tmp_path / "met", tmp_path / "again"
+    for out in (run, again):
+        out.mkdir()
+    run_training(config("train", SMALL_RUN), run)
+
+    def visit(session: SharedSession, port: int, page: object) -> None:
+        steps(session, 3)
+        session.drag(*goal_of(session, [0.0, 0.3, 0.1]))
+        steps(session, 3)
+        session.release()
+        while session.trial is not None and not session.trial.done:
+            session.step()
+        session.close()
+
+    monkeypatch.setattr("fb3d_rl.live.page.serve", visit)
+    monkeypatch.syspath_prepend(str(ROOT / "launch"))
+    view = runpy.run_path(str(ROOT / "launch" / "view.py"))
+    for _ in range(2):
+        view["watch_learner"](config("view", [*VIEW, f"checkpoint={run}", f"record={folder}"]))
+    kept, own = DemonstrationBuffer.open(folder), DemonstrationBuffer.open(run / BUFFER)
+    assert len(kept.episodes) == 2 and kept.keys.pop(("learner", "action"))[1] == torch.float32
+    assert {key: kept.keys[key] for key in own.keys} == own.keys
+    assert kept.frames(0)["expert", "acts"].flatten()[:7].tolist() == [False] * 3 + [True] * 3 + [False]
+    assert kept.frames(0)["record", "policy_version"].unique().tolist() == [2]
+
+    result = launch("demos.py", "list", str(folder), "--episode", "0", cwd=tmp_path)
+    assert result.returncode == 0 and "LLLEEEL" in result.stdout
+    result = launch("demos.py", "show", str(folder), "--episode", "1", "--out", "strip.png", cwd=tmp_path)
+    assert result.returncode == 0 and "did not repeat" not in result.stdout and (tmp_path / "strip.png").is_file()
+    exported = launch("demos.py", "export", str(folder), "out.h5", cwd=tmp_path)
+    assert exported.returncode == 0
+
+    run_training(config("train", [*SMALL_RUN, f"algo.demonstrations={folder}"]), again)
+    learnt = DemonstrationBuffer.open(again / BUFFER)
+    for k in range(2):
+        assert torch.equal(learnt.frames(k)["expert", "twist"], kept.frames(k)["expert", "twist"])
+        assert torch.equal(learnt.frames(k)["record", "policy_version"], kept.frames(k)["record", "policy_version"])
+    assert len(learnt) == len(kept) + 90
+    summary = json.loads((again / "summary.json").read_text())
+    assert summary["labels"] == 90
