@@ -14,7 +14,7 @@ from fb3d_rl.algos.collection import RowsOptions
 from fb3d_rl.algos.learners import members
 from fb3d_rl.assets.articulation import ArticulatedObject
 from fb3d_rl.contract import Key
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, recorded
+from fb3d_rl.data.demonstrations import TABLE, DemonstrationBuffer, recorded
 from fb3d_rl.env.options import EnvOptions, Trial
 from fb3d_rl.errors import UserError
 from fb3d_rl.interrupt import Deferred
@@ -77,18 +77,20 @@ class Recording:
         self._root = root
         self._categories: dict[str, str] = {}
         self._copied: list[Path] = []
-        self._folder.parent.mkdir(parents=True, exist_ok=True)
         self._lock = FileLock(self._folder.with_name(f".{self._folder.name}.lock"))
         try:
+            self._folder.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire(timeout=0)
+            try:
+                self._buffer = self._opened()
+                self.require_room()
+            except BaseException:
+                self._unlock()
+                raise
         except Timeout as error:
             raise UserError(f"another process records into {folder}; end it, or choose another folder") from error
-        try:
-            self._buffer = self._opened()
-            self.require_room()
-        except BaseException:
-            self._unlock()
-            raise
+        except OSError as error:
+            raise UserError(f"{folder} cannot be written ({error.strerror}); choose another folder") from error
 
     def keep_object(self, obj: ArticulatedObject) -> None:
         """Take note of an object, whose trials are to come; one that was made for this session is copied beside the
@@ -148,10 +150,9 @@ class Recording:
         about = recipe(self._env, Assets(root=self._root or str(self._objects)))
         if not self._folder.exists() or (self._folder.is_dir() and not any(self._folder.iterdir())):
             return DemonstrationBuffer.create(self._folder, EPISODES * self._env.horizon, about)
-        try:
-            buffer = DemonstrationBuffer.open(self._folder)
-        except UserError as error:
-            raise UserError(f"{error}; {NOT_MADE}") from error
+        if not (self._folder / TABLE).is_file():
+            raise UserError(f"{self._folder} holds no demonstrations; {NOT_MADE}")
+        buffer = DemonstrationBuffer.open(self._folder)
         held, wanted = buffer.keys, self._rows.kept()
         lacking = [key for key in wanted if key not in held]
         if len(buffer) and (lacking or len(held) > len(wanted)):

@@ -81,8 +81,10 @@ def status(moment: Moment, playing: bool) -> str:
             return "No contact point can be chosen from what the camera sees."
         return "Click the blue part to choose another contact point."
     if trial.done:
-        outcome = "**opened**" if trial.success else "**not opened** in time"
+        outcome = ("**opened**" if trial.success else "**not opened** in time") + ", "
+    elif trial.by:  # the phase is the expert's, who looks on
+        outcome = "" if playing else "**paused**, "
     else:
-        outcome = ("" if playing else "paused in phase ") + f"**{trial.phase}**"
+        outcome = ("" if playing else "paused in phase ") + f"**{trial.phase}**, "
     held = "holds the part" if trial.attached else "holds nothing"
-    return f"step {trial.steps}: {outcome}, {held}\n\nnormalized distance **{trial.distance:.2f}**"
+    return f"step {trial.steps}: {outcome}{held}\n\nnormalized distance **{trial.distance:.2f}**"
