@@ -73,7 +73,7 @@ class SharedPolicy(InteractivePolicy):
             learner, gate = acting.learner, EitherGate(gate, acting.gate)
         super().__init__(expert, learner, gate)
         self._person = person
-        # At the gripper's own speed; the expert's speeds are for parts that it cannot see well.
+        # The expert travels more slowly than the gripper can.
         self._control = Control(replace(expert.options, travel_speed=expert.limits.linear), expert.limits)
 
     @torch.no_grad()
