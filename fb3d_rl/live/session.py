@@ -199,12 +199,8 @@ class Session:
             )
         self._picked = picked
         if self.trial is not None:
-            self._go_to(self._frame, *picked)
+            FlowPolicy.go_to(self._frame, *picked)
         self.moment = self._moment()
-
-    def _go_to(self, frame: TensorDictBase, chosen: Touch, candidates: Touch) -> None:
-        """Let the policy head for a picked point from the step ``frame`` on."""
-        FlowPolicy.go_to(frame, chosen, candidates)
 
     # ------------------------------------------------------------------------------------------------- what is seen
 
@@ -322,7 +318,7 @@ class Session:
         self._base.set_trials([self._trial])
         frame = self._env.reset()
         if self._picked is not None:
-            self._go_to(frame, *self._picked)
+            FlowPolicy.go_to(frame, *self._picked)
         self._seen(frame, False)
 
     def _seen(self, frame: TensorDictBase, over: bool) -> None:

@@ -18,7 +18,6 @@ from fb3d_rl.errors import UserError
 from fb3d_rl.live.moment import Contact
 from fb3d_rl.live.person import Person, SharedPolicy
 from fb3d_rl.live.session import Session
-from fb3d_rl.policies.contact import Contact as Touch
 from fb3d_rl.policies.flow_policy import FlowPolicy
 from fb3d_rl.policies.options import FlowPolicyOptions
 
@@ -134,11 +133,6 @@ class SharedSession(Session):
 
     def _acting(self, flow_policy: FlowPolicy) -> SharedPolicy:
         return SharedPolicy(flow_policy, self._learner, self.person)
-
-    def _go_to(self, frame: TensorDictBase, chosen: Touch, candidates: Touch) -> None:
-        super()._go_to(frame, chosen, candidates)
-        # The expert is told where to go: it does not look for a point of its own, as it does after a learner's step.
-        frame["expert", "looks_on"] = torch.zeros_like(frame["expert", "looks_on"])
 
     def _begin(self) -> None:
         if self._recorder is not None:
