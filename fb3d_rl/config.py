@@ -78,13 +78,20 @@ class ViewConfig(CommandConfig):
     """Everything that launch/view.py needs."""
 
     checkpoint: str | None = option(
-        None, "an ArtFlowNet: run folder, checkpoint.pt, .safetensors or pretrained; null shows only the true flow"
+        None,
+        "an ArtFlowNet: run folder, checkpoint.pt, .safetensors or pretrained; null shows only the true flow; with "
+        "policy=bc or policy=dagger the learner's run folder or checkpoint.pt",
     )
     object: Any = option(
         None, "the folder of an object, an id, or a category, whose first object is shown; null: the first object"
     )
     port: int = option(
         8080, "port of the page, which only this machine reaches; the next free one if it is taken", within="[1, 65535]"
+    )
+    record: str | None = option(
+        None,
+        "with policy=bc or policy=dagger: folder of demonstrations to which each trial is added as an episode, new or "
+        "from before; null: nothing is kept",
     )
 
 
@@ -110,6 +117,10 @@ COMMANDS: dict[str, type[CommandConfig]] = {
     "view": ViewConfig,
     "serve": ServeConfig,
 }
+
+
+LEARNERS = tuple(name for name, entry in REGISTRY.items() if entry is registry.IMITATION)
+"""The policies that imitate, from which a person can take over."""
 
 
 def algorithms() -> dict[str, type[AlgoOptions]]:
@@ -153,7 +164,8 @@ def validate(cfg: CommandConfig) -> None:
         one_of("policy.name", cfg.policy.name, ("artflownet",))  # the algorithm says what is evaluated
         acting = cfg.algo.name
         _validate_training(cfg)
-    if isinstance(cfg, EvaluateConfig | ServeConfig) and REGISTRY[acting].trained and not cfg.checkpoint:
+    needs = isinstance(cfg, EvaluateConfig | ServeConfig) or (isinstance(cfg, ViewConfig) and acting in LEARNERS)
+    if needs and REGISTRY[acting].trained and not getattr(cfg, "checkpoint", None):
         raise UserError(f"policy={acting} needs checkpoint=PATH, a run folder of launch/train.py or its checkpoint.pt")
     if cfg.evaluation.protocol != "task" and not isinstance(cfg, EvaluateConfig):
         raise UserError(
@@ -162,7 +174,12 @@ def validate(cfg: CommandConfig) -> None:
     if REGISTRY[cfg.policy.name].outside != bool(cfg.policy.target):
         raise UserError("policy=plugin and policy.target=package.module:make, a policy of your own, go together")
     if isinstance(cfg, ViewConfig):
-        one_of("policy.name", cfg.policy.name, ("expert", "artflownet"))
+        one_of("policy.name", cfg.policy.name, ("expert", "artflownet", *LEARNERS))
+        if cfg.record is not None and cfg.policy.name not in LEARNERS:
+            raise UserError(
+                f"record={cfg.record} keeps what a person does who takes over from a learner: give policy=dagger or "
+                "policy=bc, with its checkpoint=RUN"
+            )
     _validate_task(cfg)
     if cfg.env.sim_freq % cfg.env.control_freq:
         raise UserError(f"env.sim_freq={cfg.env.sim_freq} is no multiple of env.control_freq={cfg.env.control_freq}")

@@ -478,7 +478,14 @@ def test_a_missing_checkpoint_is_named() -> None:
 
 
 @pytest.mark.parametrize(
-    ("override", "word"), [("port=0", "port=0"), ("port=70000", "65535"), ("policy=bc", "policy.name")]
+    ("override", "word"),
+    [
+        ("port=0", "port=0"),
+        ("port=70000", "65535"),
+        ("policy=random", "policy.name"),
+        ("policy=bc", "checkpoint=PATH"),
+        ("record=met", "record=met"),
+    ],
 )
 def test_what_the_live_page_cannot_do_is_named(override: str, word: str) -> None:
     with pytest.raises(UserError, match=re.escape(word)):

@@ -27,12 +27,14 @@ class Acting:
         policy: makes the policy, on the CPU.
         part_mask_input: whether its network was trained with the mask of the part to open.
         network: the flow network whose predictions are measured as well, if it has one.
+        fits: number of fits that the weights of a learner had behind them; -1 for other policies.
     """
 
     name: str
     policy: Callable[[VelocityLimits, FlowPolicyOptions], TensorDictModuleBase]
     part_mask_input: bool = True
     network: nn.Module | None = None
+    fits: int = -1
 
 
 class Algorithm(Protocol):

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 
 from fb3d_rl.algos.weights import CHECKPOINT
 from fb3d_rl.contract import Key
-from fb3d_rl.data.demonstrations import DemonstrationBuffer, EpisodeInfo, recorded
+from fb3d_rl.data.demonstrations import RECORD, DemonstrationBuffer, EpisodeInfo, recorded
 from fb3d_rl.data.samples import SampleOptions
 from fb3d_rl.errors import UserError
 from fb3d_rl.policies.hand import VelocityLimits
@@ -167,6 +167,13 @@ class RowsOptions:
         """The keys that the workers have to send."""
         told = [("next", "policy", key) for key in INTENTION] if self.guided else []
         return [*OBSERVED, *([self.flow] if self.flow else ()), *EXPERT, *self.further, *OUTCOME, *told]
+
+    def kept(self) -> list[Key]:
+        """The keys of a row in the buffer, as :meth:`of`, :func:`recorded` and the buffer make it."""
+        flow: list[Key] = [self.flow] if self.flow else []
+        told: list[Key] = [("expert", key) for key in INTENTION] if self.guided else []
+        felt: list[Key] = [("learner", "felt")] if self.history else []
+        return [*OBSERVED, *flow, *EXPERT, *self.further, *told, ("expert", "twist"), *felt, *RECORD, "episode"]
 
     def why_none(self, ended: int, error: str) -> str:
         """Why the trials of a round, of which ``ended`` did not crash, gave no rows, and what to change."""

@@ -351,7 +351,7 @@ class Imitation:
                 )
             return acting_policy(expert_policy(present, options), learner, oracle)
 
-        return Acting(name, policy)
+        return Acting(name, policy, fits=saved["step"])
 
 
 ALGORITHM = Imitation()

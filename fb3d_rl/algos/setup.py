@@ -22,6 +22,7 @@ from fb3d_rl.assets.catalog import (
     lost_geometry,
     procedural_catalog,
 )
+from fb3d_rl.assets.folders import MANISKILL
 from fb3d_rl.assets.splits import validation_ids
 from fb3d_rl.camera.options import CameraOptions
 from fb3d_rl.camera.views import ViewRange
@@ -134,6 +135,20 @@ def one_object(cfg: ViewConfig, out: Path) -> ArticulatedObject:
     if cfg.assets.source == "files":
         return entry_of(given_catalog(cfg.assets, "all"), word).load()
     return entry_of(folder_entries(cfg.assets.paths[0]), word).load()
+
+
+def object_root(cfg: ViewConfig) -> str | None:
+    """Where :func:`one_object` finds its object; None if it is made anew, and gone with the folder that it is made in.
+
+    It is the path from which :class:`~fb3d_rl.rollout.demonstrations.Assets` can read it again.
+    """
+    word = None if cfg.object is None else Path(str(cfg.object)).expanduser()
+    if word is not None and word.exists():
+        return str(word.resolve())
+    if cfg.assets.source == "procedural":
+        return None
+    given = cfg.assets.paths[0]
+    return given if given == MANISKILL else str(Path(given).expanduser().resolve())
 
 
 def load(entries: list[Entry]) -> list[tuple[ArticulatedObject, str]]:

@@ -325,6 +325,10 @@ def _require_numbers(frames: TensorDictBase) -> None:
             raise UserError(f"the data do not fit the task: observation {key} holds NaN or infinity; leave it out")
 
 
+RECORD: tuple[Key, ...] = tuple(("record", key) for key in ("beta", "policy_version", "round", "success"))
+"""The keys that :func:`recorded` adds to a row."""
+
+
 def recorded(frames: TensorDictBase, info: EpisodeInfo, beta: float, version: int) -> TensorDictBase:
     """Frames [T] with the group "record", which says how they came about; rows that have it keep theirs.
 
@@ -335,9 +339,8 @@ def recorded(frames: TensorDictBase, info: EpisodeInfo, beta: float, version: in
         version: number of fits that the weights of the learner had behind them; -1 if there was no learner.
     """
     if "record" not in frames.keys():
-        values = {"beta": beta, "policy_version": version, "round": info.round, "success": info.success}
-        for key, value in values.items():
-            frames["record", key] = torch.full((len(frames), 1), value)
+        for key, value in zip(RECORD, (beta, version, info.round, info.success), strict=True):
+            frames[key] = torch.full((len(frames), 1), value)
     return frames
 
 

@@ -30,8 +30,9 @@ from fb3d_rl.drawing.bodies import GRIPPER, Color, link_colors, srgb
 from fb3d_rl.drawing.signs import FLOW, FREE, HOLDING, arrow_mesh, cup_mesh
 from fb3d_rl.errors import UserError
 from fb3d_rl.geometry.transforms import matrix_to_quaternion, quaternion_to_matrix
+from fb3d_rl.live.moment import Moment, status
 from fb3d_rl.live.server import HOST, start_server
-from fb3d_rl.live.session import Moment, Session
+from fb3d_rl.live.session import Session
 
 COLORS: dict[str, Color] = {"predicted": FLOW, "true": srgb("#2c9f5b")}
 """Of the arrows of each flow."""
@@ -62,13 +63,19 @@ def require_viser() -> Any:
     return viser
 
 
-def serve(session: Session, port: int, until: Callable[[], bool] = lambda: False) -> None:
+def serve(
+    session: Session,
+    port: int,
+    until: Callable[[], bool] = lambda: False,
+    page: Callable[[Any, Any], Page] | None = None,
+) -> None:
     """Serve the page and run its requests, until Ctrl-C.
 
     Args:
         session: the session to show; it is closed at the end.
         port: the port, or if it is taken the next free one; it is printed.
         until: called between requests; True ends the page.
+        page: makes the page from server and session; :class:`Page` unless given.
 
     Raises:
         UserError: viser is not installed.
@@ -78,11 +85,11 @@ def serve(session: Session, port: int, until: Callable[[], bool] = lambda: False
     logging.getLogger("websockets").setLevel(logging.CRITICAL)  # browsers open connections that they do not use
     server = start_server(port, name)
     try:
-        page = Page(server, session)
+        served = (page or Page)(server, session)
         taken = "" if server.get_port() == port else f" (port {port} is taken)"
         print(f"{name}: http://{HOST}:{server.get_port()}{taken}; Ctrl-C ends it", flush=True)
         while not until():
-            page.attend()
+            served.attend()
     except KeyboardInterrupt:
         pass
     finally:
@@ -182,10 +189,10 @@ class Page:
         self._part_control = gui.add_dropdown("Open", list(names), initial_value=self._part_names[session.link])
         on_change(self._part_control, lambda name: session.set_part(names[name]))
         with gui.add_folder("Policy"):
-            acts = gui.add_dropdown(
+            self._acts_on = gui.add_dropdown(
                 "Acts on", [f"{name} flow" for name in session.flows], initial_value=f"{session.flow} flow"
             )
-            on_change(acts, lambda name: session.set_flow(name.removesuffix(" flow")))
+            on_change(self._acts_on, lambda name: session.set_flow(name.removesuffix(" flow")))
             buttons = gui.add_button_group("Trial", ("Step", "Play", "Pause", "Reset"))
 
             @buttons.on_click
@@ -354,7 +361,7 @@ class Page:
             self._measured.content = "The camera sees nothing that moves."
         else:
             self._measured.content = "For ArtFlowNet's flow beside the true one give `checkpoint=pretrained`."
-        self._status.content = _status(moment, self._playing)
+        self._status.content = status(moment, self._playing)
         session = self._session
         self._part_control.value = self._part_names[session.link]
         for (slider, scale), position in zip(self._joints, moment.qpos, strict=True):
@@ -374,21 +381,6 @@ def _ray(camera: Any, place: tuple[float, float]) -> tuple[NDArray[np.float64], 
     across, down = (2.0 * np.array(place) - 1.0) * math.tan(0.5 * camera.fov) * [camera.aspect, 1.0]
     rotation = quaternion_to_matrix(torch.as_tensor(np.asarray(camera.wxyz, dtype=np.float64))).numpy()
     return np.asarray(camera.position, dtype=np.float64), rotation @ [across, down, 1.0]
-
-
-def _status(moment: Moment, playing: bool) -> str:
-    """The state of the trial, in a line or two."""
-    trial = moment.trial
-    if trial is None:
-        if moment.contact is None:
-            return "No contact point can be chosen from what the camera sees."
-        return "Click the blue part to choose another contact point."
-    if trial.done:
-        outcome = "**opened**" if trial.success else "**not opened** in time"
-    else:
-        outcome = ("" if playing else "paused in phase ") + f"**{trial.phase}**"
-    held = "holds the part" if trial.attached else "holds nothing"
-    return f"step {trial.steps}: {outcome}, {held}\n\nnormalized distance **{trial.distance:.2f}**"
 
 
 def _arrow(start: NDArray[np.float32], vector: NDArray[np.float32], radius: float) -> list[Mesh]:

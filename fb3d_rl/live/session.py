@@ -6,7 +6,7 @@ It does not depend on the page; the simulator is loaded when a trial begins.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -26,12 +26,14 @@ from fb3d_rl.env.torchrl_env import TrialEnv, make_env, require_simulator
 from fb3d_rl.errors import UserError
 from fb3d_rl.evaluation.flow import predict
 from fb3d_rl.flow.metrics import flow_metrics
+from fb3d_rl.live.moment import FLOWS, Contact, Moment, Progress
 from fb3d_rl.models.artflownet import ArtFlowNet
 from fb3d_rl.policies.contact import Contact as Touch
 from fb3d_rl.policies.contact import choose_contact
 from fb3d_rl.policies.flow_policy import FlowPolicy, FlowPolicyOptions
 from fb3d_rl.policies.flow_state import APPROACH, PHASES, PULL, SELECT, TRAVEL
 from fb3d_rl.policies.hand import hand_axis
+from fb3d_rl.policies.interaction import InteractivePolicy
 from fb3d_rl.rollout.run import limits_of, policy_env, state_of
 from fb3d_rl.rollout.trials import schedule
 from fb3d_rl.scene.observer import observe
@@ -40,68 +42,8 @@ from fb3d_rl.scene.posed import Posed
 if TYPE_CHECKING:
     from fb3d_rl.env.task import OpenArticulatedEnv
 
-FLOWS = {"true": ("privileged", "flow"), "predicted": ("prediction", "flow")}
-"""The flows that a policy can act on; the expert acts on the true one."""
-
 PICK = 0.02
 """A click picks the foremost of the points that are at most this much (m) farther from its ray than the nearest one."""
-
-
-@dataclass(frozen=True, eq=False)
-class Contact:
-    """A contact [3] (m) with the unit vectors [3] of the pull and from the contact to the hand's standoff pose."""
-
-    point: NDArray[np.float32]
-    pull: NDArray[np.float32]
-    standoff: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Progress:
-    """State of a trial.
-
-    Attributes:
-        steps: control steps made.
-        phase: the policy's phase, one of :data:`fb3d_rl.policies.flow_policy.PHASES`.
-        distance: normalized distance, 1 at the start and 0 at the joint's limit.
-        attached: whether suction holds the part.
-        success: whether the part counts as open.
-        done: whether the trial is over.
-    """
-
-    steps: int
-    phase: str
-    distance: float
-    attached: bool
-    success: bool
-    done: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """All that a page shows.
-
-    Attributes:
-        poses: T_world_body [L, 4, 4] of the links; in a trial [L + 3, 4, 4] with hand, left and right finger.
-        qpos: joint state [J], rad or m.
-        camera: T_world_camera [4, 4]; x right, y down, z forward.
-        points: the M points of the cloud [M, 3], m.
-        part: [M], whether a point lies on the part to open.
-        flows: the true and, with a network, the predicted flow [M, 3] by their names in :data:`FLOWS`.
-        metrics: errors of the prediction (:func:`fb3d_rl.flow.metrics.flow_metrics`); empty without one.
-        contact: the policy's contact; None where it has none.
-        trial: state of the trial; None if none runs.
-    """
-
-    poses: NDArray[np.float64]
-    qpos: NDArray[np.float64]
-    camera: NDArray[np.float64]
-    points: NDArray[np.float32]
-    part: NDArray[np.bool_]
-    flows: dict[str, NDArray[np.float32]]
-    metrics: dict[str, float]
-    contact: Contact | None
-    trial: Progress | None
 
 
 class Session:
@@ -143,6 +85,7 @@ class Session:
         self._env: EnvBase | None = None
         self._base: TrialEnv | None = None
         self._points = samples.points
+        self._by = ""
         first = default_trial(obj)  # raises if nothing opens
         self._trials = {item.trial.link: item.trial for item in schedule([(obj, "")], samples, seed)[0]}
         self.parts = self._object.openable
@@ -161,8 +104,12 @@ class Session:
         if name not in self.flows:
             raise UserError(f"there is no {name} flow without a network; give its weights: checkpoint=PATH")
         self.flow = name
-        self._policy = FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options)
+        self._policy = self._acting(FlowPolicy(FLOWS[name], limits_of(self._env_options), self._policy_options))
         self._picked: tuple[Touch, Touch] | None = None
+
+    def _acting(self, flow_policy: FlowPolicy) -> FlowPolicy | InteractivePolicy:
+        """The policy that acts; given the one that follows the flow."""
+        return flow_policy
 
     def set_part(self, link: int) -> None:
         """Choose the part to open, with the joint state and the view that an evaluation would start from."""
@@ -252,7 +199,7 @@ class Session:
             )
         self._picked = picked
         if self.trial is not None:
-            self._policy.go_to(self._frame, *picked)
+            FlowPolicy.go_to(self._frame, *picked)
         self.moment = self._moment()
 
     # ------------------------------------------------------------------------------------------------- what is seen
@@ -268,6 +215,7 @@ class Session:
         camera = posed.camera.pose(trial.view)[:3, 3]
         frame["observation", "camera_position"] = torch.tensor(camera[None], dtype=torch.float32)
         self.trial: Progress | None = None
+        self._by = ""
         self._picked = None
         self._frame = self._predicted(frame)
         self._poses, self._qpos = poses, np.array(trial.start)
@@ -289,6 +237,7 @@ class Session:
         return Moment(
             poses=self._poses,
             qpos=self._qpos,
+            tip=frame["observation", "tool_pose"][0].numpy(),
             camera=self._object.camera.pose(self.view),
             points=frame["observation", "points"][valid].numpy(),
             part=frame["observation", "part_mask"][valid].numpy(),
@@ -354,8 +303,12 @@ class Session:
             return
         assert self._env is not None
         frame = self._env.step(self._policy(self._frame))
+        self._made(frame)
         over = bool(frame["next", "done"])
         self._seen(step_mdp(frame), over)
+
+    def _made(self, frame: TensorDictBase) -> None:
+        """Take note of a step [1], with what came after it below "next"."""
 
     def _begin(self) -> None:
         require_simulator("use the page without running trials")
@@ -365,7 +318,7 @@ class Session:
         self._base.set_trials([self._trial])
         frame = self._env.reset()
         if self._picked is not None:
-            self._policy.go_to(frame, *self._picked)
+            FlowPolicy.go_to(frame, *self._picked)
         self._seen(frame, False)
 
     def _seen(self, frame: TensorDictBase, over: bool) -> None:
@@ -383,6 +336,7 @@ class Session:
             attached=bool(frame["observation", "attached"]),
             success=bool(frame["success"]),
             done=over,
+            by=self._by,
         )
         self.moment = self._moment()
 

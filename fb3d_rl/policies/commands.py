@@ -59,7 +59,7 @@ def travel(state: FlowState, seen: Observed, control: Control) -> Commanded:
     cloud = seen.points.double()
     leaves = (state.leave != 0).any(-1, keepdim=True)
     straight = ~leaves & ~in_the_way(cloud, seen.valid, seen.tip, funnel, o.free)
-    velocity = _straight(seen.tip, funnel, control)
+    velocity = straight_to(seen.tip, funnel, control)
     if bool(straight.all()):
         return state, velocity
 
@@ -163,8 +163,8 @@ def above_ground(axis: Tensor, tip: Tensor, clearance: float) -> Tensor:
     return torch.where(axis[:, 2:] >= lowest, axis, lifted)
 
 
-def _straight(tip: Tensor, goal: Tensor, control: Control) -> Tensor:
-    """Velocity to a goal, slower the last bit of the way."""
+def straight_to(tip: Tensor, goal: Tensor, control: Control) -> Tensor:
+    """Velocity [E, 3] (m/s) from the tip to a goal [E, 3] (m), slower the last bit of the way."""
     way = goal - tip
     return (control.gain(6.0) * length(way)).clamp_max(control.options.travel_speed) * normalize(way)
 
@@ -177,7 +177,7 @@ def _around(tip: Tensor, goal: Tensor, centre: Tensor, radius: Tensor, control: 
     tangent = torch.linalg.cross(normalize(turn), outward)
     along = normalize(tangent + (radius - distance).clamp(-1.0, 1.0) * 4.0 * outward)
     other_side = (length(turn) > 0.35) & (distance > 0.5 * radius)
-    return torch.where(other_side, control.options.travel_speed * along, _straight(tip, goal, control))
+    return torch.where(other_side, control.options.travel_speed * along, straight_to(tip, goal, control))
 
 
 def _bounding_sphere(cloud: Tensor, valid: Tensor, margin: float) -> tuple[Tensor, Tensor]:

@@ -42,7 +42,7 @@ from fb3d_rl.geometry.transforms import alignment
 from fb3d_rl.models.artflownet import artflownet_module, needs_mask, proposes_several
 from fb3d_rl.policies.commands import above_ground, command
 from fb3d_rl.policies.contact import Contact, best_candidate
-from fb3d_rl.policies.flow_state import TRAVEL, Control, FlowState, Observed
+from fb3d_rl.policies.flow_state import SELECT, TRAVEL, Control, FlowState, Observed
 from fb3d_rl.policies.hand import VelocityLimits, hand_axis, joint_velocities
 from fb3d_rl.policies.options import FlowPolicyOptions
 from fb3d_rl.policies.policy import Policy
@@ -115,11 +115,22 @@ class FlowPolicy(Policy):
             twist=None if self.twist_key is None else tensordict[self.twist_key].double(),
         )
         state, velocity = command(advance(state, seen, self._control), seen, self._control)
-        axis = above_ground(state.standoff, seen.tip, self.options.clearance)
-        angular = self._control.gain(self.options.angular_gain) * alignment(seen.hand, axis)
-        tensordict["action"] = joint_velocities(obs, hand, velocity.to(hand), angular.to(hand), self.limits)
+        tensordict["action"] = self.steer(obs, velocity, state.standoff)
         tensordict["next", "policy"] = state.packed()
         return tensordict
+
+    def steer(self, obs: TensorDictBase, velocity: Tensor, axis: Tensor) -> Tensor:
+        """The action [E, 8] that moves the tip at a velocity and turns the hand towards an axis, above the ground.
+
+        Args:
+            obs: the contract's "observation" group [E], of which qpos and tool_pose are read.
+            velocity: [E, 3] m/s in the world, float64.
+            axis: [E, 3] unit direction from the tip to the hand that is wanted, float64.
+        """
+        hand = hand_axis(obs["tool_pose"])
+        axis = above_ground(axis, obs["tool_pose"][:, :3].double(), self.options.clearance)
+        angular = self._control.gain(self.options.angular_gain) * alignment(hand.double(), axis)
+        return joint_velocities(obs, hand, velocity.to(hand), angular.to(hand), self.limits)
 
     def choose_again(self, tensordict: TensorDictBase, where: Tensor) -> None:
         """Head for the candidate that is best by now, in environments that are on their way to a part at rest.
@@ -150,6 +161,15 @@ class FlowPolicy(Policy):
         fresh = {key: torch.zeros_like(getattr(state, key)) for key in ("chosen", "idle", "leave", "came")}
         state = state.updated(**fresh, tip=tensordict["observation", "tool_pose"][..., :3].double())
         tensordict["policy"] = state.set_out(chosen, candidates).packed()
+
+    @staticmethod
+    def choose_anew(state: TensorDictBase) -> TensorDictBase:
+        """The ("policy", ...) state of a hand that somebody else has moved: it chooses a contact point from what it
+        sees in the next step, or goes on to pull if suction holds a part by then.
+        """
+        flow_state = FlowState.from_tensordict(state)
+        everywhere = torch.ones_like(flow_state.phase, dtype=torch.bool)
+        return flow_state.changed(everywhere, phase=SELECT, leave=0.0, idle=0, chosen=0).packed()
 
 
 def expert_policy(limits: VelocityLimits, options: FlowPolicyOptions | None = None) -> FlowPolicy:

@@ -119,6 +119,8 @@ def test_the_benchmark_says_what_is_wrong(
         (["object=Spaceship"], ["Spaceship", "Microwave"]),
         (["port=99999"], ["port=99999", "65535"]),
         (["checkpoint=nowhere.safetensors"], ["nowhere.safetensors"]),
+        (["record=met"], ["record=met", "policy=dagger"]),
+        (["policy=dagger", "checkpoint=nowhere", "record=met"], ["nowhere"]),
     ],
 )
 def test_the_live_page_says_what_is_wrong_and_leaves_nothing(
