@@ -47,10 +47,12 @@ class Hand(NamedTuple):
     Attributes:
         axis: [B, 3] unit direction from the tip to the hand.
         held: [B, 1] whether the part is held, 0 or 1.
+        touch: [B, T] what it feels and has felt: hold and force.
     """
 
     axis: Tensor
     held: Tensor
+    touch: Tensor
 
 
 class Told(NamedTuple):
@@ -92,8 +94,10 @@ class Told(NamedTuple):
 class Guide(nn.Module):
     """Tells the expert's intention.
 
-    First the contact point, with the standoff at each point; then, for one contact point, the phase: whether the hand
-    is to approach depends on how it stands to the point that was chosen.
+    First the contact point, with the standoff at each point; then, for one contact point, the phase. Whether the hand
+    is to approach follows from how it stands to the point that was chosen, so only this and what it feels is read for
+    that. Where a learner stands still before its own point, the expert, which has chosen another one, is on its way: who
+    reads that the hand stands still learns to stay on its way for ever.
 
     Args:
         inputs: as of :class:`~fb3d_rl.models.encoders.PointNet`.
@@ -102,12 +106,15 @@ class Guide(nn.Module):
         width: as of the same.
         contact: whether :meth:`words` say the contact point.
         phase: whether they say the phase.
+        touch: T, numbers that the hand feels (:class:`Hand`).
     """
 
     SCALES, OFF_LINE, TURNS = (0.02, 0.05, 0.15), (0.02, 0.06), (0.05, 0.15)
     """What the words distinguish: distances to the contact point, distances to the approach line (m), angles (rad)."""
 
-    def __init__(self, inputs: int, context: int, phases: int, width: int, contact: bool, phase: bool) -> None:
+    def __init__(
+        self, inputs: int, context: int, phases: int, width: int, contact: bool, phase: bool, touch: int = 2
+    ) -> None:
         super().__init__()
         self.contact, self.phase = contact, phase
         place = contact * (16 + len(self.SCALES) + len(self.OFF_LINE) + len(self.TURNS))
@@ -115,7 +122,7 @@ class Guide(nn.Module):
         if contact:
             self.side = nn.Linear(width, 3)
         if phase:
-            self.phases = mlp(width + context + place, 2 * width, phases)
+            self.phases = mlp(place + touch if contact else width + context, 2 * width, phases)
         self.size = place + phase * phases
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Told:
@@ -130,8 +137,8 @@ class Guide(nn.Module):
 
     def phase_logits(self, told: Told, contact: Tensor, standoff: Tensor, context: Tensor, hand: Hand) -> Tensor:
         """Logits of the phases [B, P] of a hand that goes to ``contact`` from the side ``standoff``."""
-        place = [self._place(contact, standoff, hand)] if self.contact else []
-        logits: Tensor = self.phases(torch.cat([told.scene, context, *place], dim=1))
+        read = [self._place(contact, standoff, hand), hand.touch] if self.contact else [told.scene, context]
+        logits: Tensor = self.phases(torch.cat(read, dim=1))
         return logits
 
     def words(self, intention: Intention, hand: Hand) -> Tensor:

@@ -30,6 +30,9 @@ all in the world; held, force, height of the tip. They lie under the key "felt".
 HELD = 12
 """Which of them says whether the part is held."""
 
+FORCE = 13
+"""Which of them is the contact force."""
+
 GOAL = ("contact_point", "standoff")
 """What a learner that tells the contact point keeps to while it is on its way."""
 
@@ -65,7 +68,7 @@ FLOW_KEYS: dict[str, Key | None] = {
 
 def hand_in(felt: Tensor) -> Hand:
     """The hand of the network's inputs "felt" [B, 1 + history, HAND_FEATURES]."""
-    return Hand(felt[:, 0, :3], felt[:, 0, HELD, None])
+    return Hand(felt[:, 0, :3], felt[:, 0, HELD, None], felt[..., [HELD, FORCE]].flatten(1))
 
 
 class TwistNetwork(PlanNetwork):
@@ -84,7 +87,8 @@ class TwistNetwork(PlanNetwork):
         inputs = 1 + 3 * (FLOW_KEYS[options.flow] is not None)
         context, width = HAND_FEATURES * (1 + options.history), options.width
         if options.guided:
-            self.guide = Guide(inputs, context, len(PHASES), width, options.contact, options.phase)
+            told, touch = (options.contact, options.phase), 2 * (1 + options.history)
+            self.guide = Guide(inputs, context, len(PHASES), width, *told, touch)
             context += self.guide.size
         self.encoder = ENCODERS[options.encoder](inputs, context, outputs, width)
 

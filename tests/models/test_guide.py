@@ -32,11 +32,9 @@ def test_it_chooses_one_of_two_places_and_not_their_mean() -> None:
     net, (points, features, valid, context) = guide(), scene(64)
     first = (torch.rand(64, generator=torch.Generator().manual_seed(1)) < 0.5)[:, None]
     contact = torch.where(first, points[:, 3], points[:, 13])
-    up = torch.tensor([0.0, 0.0, 1.0]).expand(64, 3)
-    free = Hand(up, torch.zeros(64, 1))
+    up, phase = torch.tensor([0.0, 0.0, 1.0]).expand(64, 3), torch.arange(64) % 2  # what it feels says the phase
+    free = Hand(up, torch.zeros(64, 1), phase[:, None].expand(64, 2).float())
     side = torch.where(first, up, up.roll(1, 1))
-    phase = torch.arange(64) % 2
-    context[:, 0] = phase.float()  # says the phase
     optimizer = torch.optim.Adam(net.parameters(), lr=3e-3)
     for _ in range(150):
         optimizer.zero_grad()
@@ -64,10 +62,13 @@ def test_whether_to_approach_depends_on_how_the_hand_stands_to_the_point_that_wa
     for _ in range(200):
         optimizer.zero_grad()
         told = net(points, features, valid, context)
-        logits = net.phase_logits(told, contact, side, context, Hand(side, torch.zeros(64, 1)))
+        logits = net.phase_logits(told, contact, side, context, Hand(side, torch.zeros(64, 1), torch.zeros(64, 2)))
         functional.cross_entropy(logits, on_the_line.long()).backward()
         optimizer.step()
     assert (logits.argmax(1) == on_the_line).float().mean() > 0.95, "the cloud says nothing about it"
+    hand = Hand(side, torch.zeros(64, 1), torch.zeros(64, 2))
+    other = net.phase_logits(net(points.flip(0), features, valid, context + 1.0), contact, side, context + 1.0, hand)
+    assert torch.equal(other, net.phase_logits(told, contact, side, context, hand)), "and neither does its own motion"
 
 
 def test_only_the_part_is_touched_and_what_is_not_there_never() -> None:
@@ -93,7 +94,9 @@ def test_words_are_in_the_frame_of_the_approach_line_and_end_with_the_hold() -> 
     net = guide(phase=False)
     axis = functional.normalize(torch.tensor([[1.0, 2.0, 2.0]]), dim=1)
     intention = Intention(-0.3 * axis + 0.02 * torch.tensor([[0.0, 1.0, -1.0]]), axis, torch.eye(PHASES)[:1])
-    free, held = (net.words(intention, Hand(axis.roll(1, 1), torch.tensor([[x]]))) for x in (0.0, 1.0))
+    free, held = (
+        net.words(intention, Hand(axis.roll(1, 1), torch.tensor([[x]]), torch.zeros(1, 2))) for x in (0.0, 1.0)
+    )
     assert free.shape == (1, net.size) and not held.any()
     ahead, aside, turn, near = free[0, 12], free[0, 13:16], free[0, 16:19], free[0, 19:]
     assert torch.allclose(ahead, torch.tensor(0.3)), "so far in front of the point"
@@ -103,9 +106,9 @@ def test_words_are_in_the_frame_of_the_approach_line_and_end_with_the_hold() -> 
     wanted = [-0.02 * 2**0.5 / scale for scale in net.OFF_LINE] + [-angle / scale for scale in net.TURNS]
     assert torch.allclose(near, torch.tensor(wanted).exp(), atol=1e-5)
     both = guide()
-    assert torch.equal(both.words(intention, Hand(axis, torch.ones(1, 1)))[0, -PHASES:], intention.phase[0]), (
-        "phases stay"
-    )
+    assert torch.equal(
+        both.words(intention, Hand(axis, torch.ones(1, 1), torch.zeros(1, 2)))[0, -PHASES:], intention.phase[0]
+    ), "phases stay"
 
 
 def test_what_is_told_turns_with_the_points() -> None:
