@@ -134,13 +134,15 @@ POLICIES = (
     Row("UMP-DI (told where to touch)", "ump_di", "ump_di"),
     Row("screw parameters", "screwnet", "screwnet"),
     Row("surface normal", "normal", "normal"),
+    Row("random", "random", "random"),
     Row("BC", "bc", "bc"),
     Row("BC + F (told the true flow)", "bc_flow", "bc_flow"),
     Row("DAgger E2E", "dagger", "dagger"),
     Row("DAgger E2E, contact point and phase", "dagger_told", "dagger"),
-    Row("DAgger E2E + published ArtFlowNet's flow", "dagger_predicted", "dagger_artflow"),
+    Row("DAgger E2E, contact point, phase, published ArtFlowNet's flow", "dagger_predicted", "dagger_artflow"),
     Row("DAgger E2E + F", "dagger_flow", "dagger_flow"),
     Row("DAgger Oracle (driven to the contact point)", "dagger_oracle", "dagger_oracle"),
+    Row("DAgger Oracle + published ArtFlowNet's flow", "dagger_oracle_predicted", "dagger_oracle_artflow"),
     Row("DAgger Oracle + F", "dagger_oracle_flow", "dagger_oracle_flow"),
 )
 """results/comparison."""
@@ -151,7 +153,7 @@ TWO = (Row("expert (true flow)", "", "expert"), Row("ArtFlowNet", "", "artflowne
 
 
 HEADLINE = ("expert", "artflownet_published", "artflownet", "flowbotpp_10", "screwnet", "bc", "bc_flow", "dagger",
-            "dagger_predicted", "dagger_flow", "dagger_oracle", "dagger_oracle_flow")  # fmt: skip
+            "dagger_told", "dagger_predicted", "dagger_flow", "dagger_oracle", "dagger_oracle_flow")  # fmt: skip
 """Folders of those of POLICIES that the first page shows."""
 
 
@@ -209,9 +211,7 @@ def imitation_partnet_mobility() -> Lines:
 GUIDED = (
     ("default", "plain"),
     ("`focus=part`", "part"),
-    ("`contact=true phase=true`", "guided"),
     ("`contact=true phase=true focus=part`", "guided_part"),
-    ("`encoder=artflownet`", "artflownet"),
 )
 """Options of algo.learner and the folders of their runs, which end with a seed."""
 
@@ -231,6 +231,21 @@ def imitation_contact() -> Lines:
         "contact, unseen ones": share("contact_rate", below, "test"),
         "contact": share("contact_rate", below),
         "success": share("success_rate", below),
+    })  # fmt: skip
+
+
+TOLD = ("dagger", "dagger_told", "dagger_predicted", "dagger_oracle", "dagger_oracle_predicted")
+"""Folders of those of POLICIES that show what a learner has to be told."""
+
+
+def imitation_told() -> Lines:
+    """What brings a learner to the parts of real objects, and what opens them."""
+    below = "comparison"
+    return trials([row for row in POLICIES if row.folder in TOLD], {
+        "contact, known kinds": share("contact_rate", below, "train_test"),
+        "contact, new kinds": share("contact_rate", below, "test"),
+        "success, known kinds": share("success_rate", below, "train_test"),
+        "success, new kinds": share("success_rate", below, "test"),
     })  # fmt: skip
 
 
@@ -414,6 +429,30 @@ def ablation() -> Lines:
     return table(["", "flow cosine", "best answer", "opened", "opened, class mean", "look-alike doors"], body)
 
 
+ANSWERS = (
+    Row("one answer", "comparison/artflownet", "artflownet"),
+    Row("four answers, winner takes all", "ablation/four_answers", "artflownet"),
+    Row("flow matching, eight draws", "ablation/flow_matching", "flow_matching"),
+)
+"""The same encoder and clouds with other heads."""
+
+
+def answers() -> Lines:
+    """Several answers by winner takes all and by flow matching, on real objects of new kinds."""
+
+    def number(key: str) -> Cell:
+        return lambda row: plain(summary(row.folder)["by_split"]["test"][key])
+
+    return trials(ANSWERS, {
+        "flow cosine": number("flow/cosine"),
+        "either sense": number("flow/axis_cosine"),
+        "best answer": number("flow/best_cosine"),
+        "RMSE": number("flow/rmse"),
+        "trials": lambda row: str(summary(row.folder)["by_split"]["test"][f"{row.policy}/n"]),
+        "opened": share("success_rate", split="test"),
+    })  # fmt: skip
+
+
 def _logged(name: str) -> list[dict[str, float]]:
     """The rows of a training's log that hold a validation."""
     rows = [json.loads(line) for line in (RESULTS / "learning_curve" / f"{name}.jsonl").read_text().splitlines()]
@@ -446,9 +485,9 @@ def learning_curve_seeds() -> Lines:
 TABLES: dict[str, Callable[[], Lines]] = {
     function.__name__: function
     for function in (
-        headline, imitation, imitation_unseen, imitation_partnet_mobility, imitation_contact, comparison,
-        procedural, partnet_mobility,
-        flow_published, transfer, transfer_categories, pretrained, touch, ablation, learning_curve,
+        headline, imitation, imitation_unseen, imitation_partnet_mobility, imitation_contact, imitation_told,
+        comparison, procedural, partnet_mobility,
+        flow_published, transfer, transfer_categories, pretrained, touch, ablation, answers, learning_curve,
         learning_curve_seeds, robot, robot_ablation,
     )
 }  # fmt: skip

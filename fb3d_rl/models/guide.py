@@ -96,8 +96,8 @@ class Guide(nn.Module):
 
     First the contact point, with the standoff at each point; then, for one contact point, the phase. Whether the hand
     is to approach follows from how it stands to the point that was chosen, so only this and what it feels is read for
-    that. Where a learner stands still before its own point, the expert, which has chosen another one, is on its way: who
-    reads that the hand stands still learns to stay on its way for ever.
+    that. Where a learner stands still before its own point, the expert, which has chosen another one, is on its way: a
+    network that read that the hand stands still would learn to stay on its way for ever.
 
     Args:
         inputs: as of :class:`~fb3d_rl.models.encoders.PointNet`.

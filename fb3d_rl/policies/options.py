@@ -320,8 +320,8 @@ class LearnerOptions:
     )
     contact: bool = option(
         False,
-        "whether it also learns to tell the expert's contact point, as a score for each point of the cloud, and from "
-        "which side the hand comes; it plans for what it tells",
+        "whether it also learns to tell the expert's contact point, as a score for each point of the part, and from "
+        "which side the hand comes; it plans for what it tells, and keeps to it on its way (best with focus=part)",
         later=True,
     )
     phase: bool = option(False, "likewise the expert's phase: on its way, approaching, pulling ...", later=True)
