@@ -235,7 +235,7 @@ def test_a_learner_pulls_as_it_would_in_its_own_task(monkeypatch: pytest.MonkeyP
     twist = torch.tensor([[[-1.0, 0.0, 0.0, 0.0, 0.0, 0.4]]])  # to where the box's front faces, and a turn about z
     felt: list[torch.Tensor] = []
 
-    def planned(inputs: TensorDict, noise: torch.Tensor | None = None) -> tuple[torch.Tensor, None]:
+    def planned(inputs: TensorDict, *_: object) -> tuple[torch.Tensor, None]:
         felt.append(inputs["felt"])
         return twist.expand(1, learner.options.chunk, 6), None
 
