@@ -134,12 +134,12 @@ class AttentionPointNet(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor) -> Tensor:
         """See the class."""
-        return self.attend(points, features, valid, context)[0]
+        return self.out(self.attend(points, features, valid, context)[0])
 
     def attend(
         self, points: Tensor, features: Tensor, valid: Tensor, context: Tensor, among: Tensor | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The result, the points' scores [B, heads, N] and features [B, N, width].
+        """What the last MLP reads [B, ...], the points' scores [B, heads, N] and features [B, N, width].
 
         Args:
             points: as of :class:`PointNet`.
@@ -157,7 +157,7 @@ class AttentionPointNet(nn.Module):
         scores = (self.score.weight @ again.mT).masked_fill(~(valid if among is None else among)[:, None], -1e9)
         weight = scores.softmax(-1)  # [B, heads, N]
         attended = torch.cat([weight @ own, weight @ again], dim=-1)  # [B, heads, own + width]
-        return self.out(torch.cat([scene, attended.flatten(1), context], dim=-1)), scores, again
+        return torch.cat([scene, attended.flatten(1), context], dim=-1), scores, again
 
     def _first(self, own: Tensor) -> Tensor:
         """The first layer, with zeros up to a multiple of four inputs: else its gradient takes three times as long."""

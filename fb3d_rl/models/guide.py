@@ -62,13 +62,13 @@ class Told(NamedTuple):
         points: [B, N, 3] the points relative to the tip.
         scores: [B, N] their scores, -1e9 of those that cannot be touched.
         standoff: [B, N, 3] directions from each of them to the hand, of any length.
-        scene: [B, W] what the guide has seen.
+        seen: [B, W] what the guide has seen, for its network's last MLP.
     """
 
     points: Tensor
     scores: Tensor
     standoff: Tensor
-    scene: Tensor
+    seen: Tensor
 
     def likeliest(self) -> tuple[Tensor, Tensor]:
         """The likeliest contact point [B, 3] and the unit standoff there [B, 3]."""
@@ -132,12 +132,15 @@ class Guide(nn.Module):
         """
         part = valid & (features[..., 0] > 0)
         touchable = torch.where(part.any(1, keepdim=True), part, valid)
-        scene, scores, each = self.network.attend(points, features, valid, context, touchable)
-        return Told(points, scores[:, 0], self.side(each) if self.contact else torch.zeros_like(points), scene.relu())
+        seen, scores, each = self.network.attend(points, features, valid, context, touchable)
+        return Told(points, scores[:, 0], self.side(each) if self.contact else torch.zeros_like(points), seen)
 
     def phase_logits(self, told: Told, contact: Tensor, standoff: Tensor, context: Tensor, hand: Hand) -> Tensor:
         """Logits of the phases [B, P] of a hand that goes to ``contact`` from the side ``standoff``."""
-        read = [self._place(contact, standoff, hand), hand.touch] if self.contact else [told.scene, context]
+        if self.contact:
+            read = [self._place(contact, standoff, hand), hand.touch]
+        else:
+            read = [self.network.out(told.seen).relu(), context]
         logits: Tensor = self.phases(torch.cat(read, dim=1))
         return logits
 
